@@ -9,7 +9,7 @@ SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs bench studies schemas clean
+.PHONY: help setup fleet test quick check docs extras bench studies schemas clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -42,6 +42,17 @@ check: setup     ## what CI runs beside the tests: style, types, layers, generat
 
 docs: setup      ## build the documents as a site: build/site/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+extras:          ## install each extra alone into an environment of its own, and run what it is for (some three minutes)
+	rm -rf build/extras && mkdir -p build/extras
+	set -e; for extra in sim vehicle cloud client; do $(PYTHON) -m venv build/extras/$$extra; \
+	  build/extras/$$extra/bin/pip install --quiet --disable-pip-version-check -c constraints.txt $$(test $$extra = client && echo . || echo ".[$$extra]"); done
+	cd build/extras && sim/bin/gnd sim world write street.json --seed 11 --length 100
+	cd build/extras && sim/bin/gnd sim drive street.json drive.mcap --sensor vlp16 --cars 0
+	cd build/extras && vehicle/bin/gnd map build -o map.sqlite drive.mcap
+	cd build/extras && vehicle/bin/gnd localise drive.mcap --map map.sqlite --out poses
+	cd build/extras && cloud/bin/gnd merger --help > merger.txt && cloud/bin/gnd map verify map.sqlite
+	cd build/extras && client/bin/gnd map info map.sqlite && client/bin/python -c "import gnd; print(len(gnd.Map('map.sqlite').gaussians()))"
 
 bench: setup     ## measure speed beside others who do the same work, on this machine: docs/benchmarks.md
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[peers]'

@@ -9,14 +9,13 @@ from typing import Any, Final
 from gnd.cloud_merger.checking import IngestLimits
 from gnd.cloud_merger.confirmation import ConfirmationParameters
 from gnd.cloud_merger.errors import MergerError
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.merge import MergeParameters
-from gnd.cloud_merger.waiting import WaitingLimits
 from gnd.cloud_merger.wants import WantParameters
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.gnd_map.config import from_mapping
 from gnd.gnd_map.settings import check_settings, setting
+from gnd.schemas.feature_layer import LayerParameters, checked_layers
 from gnd.tile_store.values import DEFAULT_CODEC, StoreConfig, lattice_named
 
 _SHARD_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -37,21 +36,19 @@ class ShardConfig:
         "How statements become changes in feature layers.",
     )
     ingest: IngestLimits = setting(IngestLimits, "Which reports are refused.")
-    feature_limits: FeatureLimits = setting(FeatureLimits, "Which reports about features are refused.")
-    want: WantParameters = setting(WantParameters, "Which Gaussians of reports in short are asked for.")
-    waiting: WaitingLimits = setting(
-        WaitingLimits,
-        "For how many reports, and how long, Gaussians that were asked for are not asked of others.",
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (),
+        "Feature layers that the user declares: reports of other kinds or another geometry are refused there, and"
+        " `reach_m` is the layer's own. Undeclared layers take what vehicles report.",
     )
+    want: WantParameters = setting(WantParameters, "Which Gaussians of reports in short are asked for.")
     store: StoreConfig = setting(StoreConfig, "Batching of the store.")
     codec: str = setting(
         DEFAULT_CODEC,
         'How finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all '
         "shards of a store use the same. Other tiles stay as fine as their base.",
     )
-    tiles_at_once: int = setting(16, "Tiles claimed together; each is published as soon as it is merged.", least=1)
     expanders: int = setting(2, "Threads that look at what was acknowledged.", least=1)
-    uploads_at_once: int = setting(8, "Uploads that such a thread claims together.", least=1)
     lease_s: float = setting(
         10.0,
         "How long a claim holds that nobody renews: its shard has died or hangs.",
@@ -75,13 +72,17 @@ class ShardConfig:
         unit="s",
         least=0,
     )
-    announce_at_once: int = setting(256, "Publish a notice for at most so many versions in one round.", least=1)
 
     def __post_init__(self) -> None:
         if not _SHARD_ID.fullmatch(self.shard_id):
             raise MergerError(f"shard id {self.shard_id!r} must be 1 to 64 of letters, digits, '.', '_', '-'")
         lattice_named(self.codec)
         check_settings(self, MergerError)
+        checked_layers(self.feature_layer)
+
+    def merge_of(self, layer: str) -> FeatureMergeParameters:
+        """How statements about a feature layer become changes."""
+        return self.features.of_layer(checked_layers(self.feature_layer).get(layer))
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> "ShardConfig":

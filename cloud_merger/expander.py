@@ -36,6 +36,8 @@ from gnd.tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
 from gnd.tile_store.values import ReportRow
 
 REMEMBERED_DISTRICTS: Final = 32
+UPLOADS_AT_ONCE: Final = 8
+"""Uploads that a thread claims together."""
 DAMAGED_RETRY_S: Final = 2.0
 _LOG = logging.getLogger(__name__)
 Tell = Callable[[str, ReportState], object]
@@ -71,8 +73,8 @@ class Expander:
         bases: Bases | None = None,
     ) -> None:
         self._store, self._config, self._tell, self._on_journaled = store, config, tell, on_journaled
-        self._short = ShortReports(store, config.merge, config.want, config.waiting, bases or Bases(store))
-        self._features = FeatureInbox(store, config.feature_limits, config.features.reach_m, config.ingest.reach_tiles)
+        self._short = ShortReports(store, config.merge, config.want, bases or Bases(store))
+        self._features = FeatureInbox(store, config.features, config.feature_layer, config.ingest.reach_tiles)
         self._map = MapCheck(store, config.ingest)
         self._lock = Lock()
         self._districts: OrderedDict[str, None] = OrderedDict()  # newest last
@@ -89,7 +91,7 @@ class Expander:
         Raises:
             StoreError: the store has failed; what was claimed waits for the end of its lease.
         """
-        claims = self._store.claim_uploads(self._config.shard_id, self._config.uploads_at_once, self._config.lease_s)
+        claims = self._store.claim_uploads(self._config.shard_id, UPLOADS_AT_ONCE, self._config.lease_s)
         for claim in claims:
             self._work_on(claim)
         return len(claims)

@@ -18,7 +18,7 @@ from gnd.cloud_merger.confirmation import (
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.association import FEATURE_LINE_REACH_M
 from gnd.cloud_merger.features.existence import FEATURE_ABSENCE, FEATURE_CEILING, FEATURE_PRIOR, FEATURE_VIEW_MARGIN_M
-from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.parameters import FEATURE_GATE, FeatureMergeParameters
 from gnd.cloud_merger.features.publication import FEATURE_MOST_WEIGHT, FEATURE_RENEWAL_MASS, FEATURE_VOTERS
 from gnd.cloud_merger.features.tracks import FEATURE_MAX_BEGUN, FEATURE_MOVED_M
 from gnd.cloud_merger.parameters import (
@@ -43,6 +43,7 @@ from gnd.cloud_merger.shift import (
 from gnd.gnd_map.config import from_mapping, to_mapping
 from gnd.gnd_map.errors import ConfigError
 from gnd.gnd_map.settings import merged
+from gnd.schemas.feature_layer import LayerParameters
 
 _FORMAT: Final = 1
 _GROUPS: Final[dict[str, type[Any]]] = {
@@ -75,6 +76,7 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
         "refuted_share": SHIFT_REFUTED_SHARE,
     },
     "features": {
+        "gate": FEATURE_GATE,
         "line_reach_m": FEATURE_LINE_REACH_M,
         "moved_m": FEATURE_MOVED_M,
         "prior": FEATURE_PRIOR,
@@ -93,6 +95,8 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
 def text_of(config: ShardConfig) -> str:
     """The canonical text: JSON with sorted keys. Equal parameters give equal texts; floats come back bit for bit."""
     said: dict[str, Any] = merged(_CONSTANTS, {name: to_mapping(getattr(config, name)) for name in _GROUPS})
+    if config.feature_layer:
+        said["feature_layer"] = [to_mapping(layer) for layer in config.feature_layer]
     return json.dumps(said | {"codec": config.codec, "format": _FORMAT}, sort_keys=True, separators=(",", ":"))
 
 
@@ -115,7 +119,8 @@ def with_text(config: ShardConfig, text: str) -> ShardConfig:
             raise MergerError(f"parameters of format {said['format']}, this release reads {_FORMAT}")
         _take_constants(said)
         groups = {name: from_mapping(kind, said[name], where=name) for name, kind in _GROUPS.items()}
-        return replace(config, codec=said["codec"], **groups)
+        declared = tuple(from_mapping(LayerParameters, table) for table in said.get("feature_layer", ()))
+        return replace(config, codec=said["codec"], feature_layer=declared, **groups)
     except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
         raise MergerError(
             f"merge parameters {digest_of(text)[:16]}… cannot be read by this release: {error}"

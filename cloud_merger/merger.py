@@ -30,6 +30,10 @@ from gnd.tile_store.values import Claim
 
 __all__ = ["ShardConfig", "run_shard", "run_worker"]
 STORE_RETRY_S: Final = 1.0
+ANNOUNCE_AT_ONCE: Final = 256
+"""Notices for at most so many versions are published in one round."""
+TILES_AT_ONCE: Final = 16
+"""Tiles that are claimed together; each is published as soon as it is merged."""
 ANNOUNCE_EVERY_S: Final = 0.05
 _LOG = logging.getLogger(__name__)
 
@@ -101,7 +105,7 @@ def run_worker(
         while not stop.is_set():
             claims: list[Claim] = []
             try:
-                claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=expander.districts)
+                claims = store.claim(config.shard_id, TILES_AT_ONCE, config.lease_s, prefer=expander.districts)
                 leases.hold(claims)
                 worker.begin(claims)
                 for some in in_turn(claims):
@@ -110,8 +114,8 @@ def run_worker(
                     for claim in some:
                         leases.drop(claim)
                     # after the commit; tiles of one batch are announced together
-                    metrics.announced(announcer.announce(config.announce_at_once, every_s=ANNOUNCE_EVERY_S))
-                n_announced = announcer.announce(config.announce_at_once)
+                    metrics.announced(announcer.announce(ANNOUNCE_AT_ONCE, every_s=ANNOUNCE_EVERY_S))
+                n_announced = announcer.announce(ANNOUNCE_AT_ONCE)
                 metrics.announced(n_announced)
                 if not claims and not n_announced:
                     wake.wait(worker.idle_s(store.ready_in_s()))

@@ -12,7 +12,7 @@ from gnd.cloud_merger.expanding import base_versions, expand, is_askable, with_m
 from gnd.cloud_merger.in_play import TilesInPlay
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.stored import Bases, said
-from gnd.cloud_merger.waiting import Promises, WaitingLimits
+from gnd.cloud_merger.waiting import Promises
 from gnd.cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
 from gnd.gnd_map.codec import decode_mask, encode_mask
 from gnd.gnd_map.errors import CodecError
@@ -55,14 +55,11 @@ class ShortReports:
         store: of tiles and reports.
         merge: how statements will be merged.
         want: which Gaussians are asked for.
-        waiting: how many promises are remembered.
         bases: versions of tiles in memory.
     """
 
-    def __init__(
-        self, store: Store, merge: MergeParameters, want: WantParameters, waiting: WaitingLimits, bases: Bases
-    ) -> None:
-        self.promises = Promises(waiting)
+    def __init__(self, store: Store, merge: MergeParameters, want: WantParameters, bases: Bases) -> None:
+        self.promises = Promises()
         self._store, self._merge, self._want = store, merge, want
         self._bases = bases
         self._in_play = TilesInPlay(store, merge, self._bases)

@@ -7,41 +7,30 @@ more than it had to.
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from threading import Lock
 from typing import Final
 
 import numpy as np
 
-from gnd.cloud_merger.errors import MergerError
 from gnd.gnd_map.arrays import I32
-from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 
+MOST_REPORTS: Final = 1024
+"""Promises of at most so many reports; the oldest are forgotten first."""
+KEEP_S: Final = 120.0
+"""For so long a Gaussian that was asked for counts as promised."""
 _NS_PER_S: Final = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class WaitingLimits:
-    """How much may be promised."""
-
-    reports: int = setting(1024, "At most so many; the oldest are forgotten first.", least=1)
-    keep_s: float = setting(120.0, "For so long a Gaussian that was asked for counts as promised.", unit="s", above=0)
-
-    def __post_init__(self) -> None:
-        check_settings(self, MergerError)
 
 
 class Promises:
     """The voxels of which Gaussians were asked, by report; safe in several threads.
 
     Args:
-        limits: what is kept at most.
         now_ns: the clock, int ns.
     """
 
-    def __init__(self, limits: WaitingLimits, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._limits, self._now_ns = limits, now_ns
+    def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._now_ns = now_ns
         self._lock = Lock()
         self._asked: OrderedDict[str, tuple[int, str, Mapping[TileId, I32]]] = OrderedDict()  # oldest first
 
@@ -70,9 +59,9 @@ class Promises:
         return np.concatenate([np.zeros(0, np.int32), *parts])
 
     def _make_room(self) -> None:
-        before_ns = self._now_ns() - round(self._limits.keep_s * _NS_PER_S)
+        before_ns = self._now_ns() - round(KEEP_S * _NS_PER_S)
         while self._asked:
             report_id, (since_ns, _, _) = next(iter(self._asked.items()))
-            if since_ns >= before_ns and len(self._asked) <= self._limits.reports:
+            if since_ns >= before_ns and len(self._asked) <= MOST_REPORTS:
                 return
             del self._asked[report_id]

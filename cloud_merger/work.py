@@ -1,7 +1,8 @@
 """From claimed tiles to publications: load, decode, merge; a tile whose merge fails does not stop the others."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Final, TypeVar
 
 from gnd.cloud_merger.belief import ShiftTests, courses_of
@@ -13,6 +14,7 @@ from gnd.cloud_merger.snapping import REMEMBERED_TILES, Snapping
 from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window
 from gnd.cloud_merger.window import WindowMerger, fold, provenance_of
 from gnd.gnd_map.by_object import ByObject
+from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import Feature, FeatureTile, is_feature_layer
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
@@ -23,6 +25,9 @@ from gnd.tile_store.values import Basis, Claim, Publication, PublishResult, Repo
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
+StateT = TypeVar("StateT")
+ReportsT = TypeVar("ReportsT")
+MergedT = TypeVar("MergedT")
 SETTLED_TOGETHER: Final = 4
 """Tiles; more would wait too long for each other."""
 
@@ -97,7 +102,7 @@ class Worker:
             return None
         try:
             work = self._store.load(claim)
-            return self._of_features(work) if is_feature_layer(claim.layer) else self._publication(work)
+            return self._of_features(work) if is_feature_layer(claim.layer) else self._of_gaussians(work)
         except StoreError as error:
             if not isinstance(error, StoreDamaged):
                 raise  # the store's failure, not the tile's
@@ -114,69 +119,63 @@ class Worker:
         else:
             self._store.postpone(claim, self._config.retry_s * claim.attempts)
 
-    def _publication(self, work: TileWork) -> Publication:
-        """Fold the windows that are closed, merge the open one into what they come to; the tile is None where the head
-        has that content.
-        """
-        tile, journal, config = work.claim.tile, work.journal, self._config
+    def _of_gaussians(self, work: TileWork) -> Publication:
+        """Of a tile of the voxel map."""
+        tile, config = work.claim.tile, self._config
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
-        state = self._contents.state(tile, journal)
         named = self._store.shifted_vehicles()
         merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named, self._snapping)
         lattice = lattice_of_tile(work.epoch, epoch, config.codec)
         by_window = reports_by_window(work.reports, config.merge, self._unreadable)
-        closed = [window for window in sorted(by_window) if window < journal.window]
-        folded = []
-        for window in closed:
-            folded.append(merger.merge(state, by_window[window], lattice))
-            state = fold(state, folded[-1])
-        now = merger.merge(state, by_window.get(journal.window, []), lattice)
-        version = work.base_version + 1
+        state, merges, closed = _through_windows(
+            self._contents.state(tile, work.journal),
+            by_window,
+            work.journal.window,
+            lambda state, reports: merger.merge(state, reports or [], lattice),
+            lambda state, merged, _reports: fold(state, merged),
+        )
+        now, version = merges[-1], work.base_version + 1
         # the very object where nothing was decided otherwise: its hash is known
         new = self._made.of(now.gaussians, lambda: Tile(tile, version, now.gaussians), (tile, version))
-        is_new = new.sha != work.head.sha if work.head else len(new.gaussians) > 0
         self._contents.keep(new)
-        return Publication(
-            claim=work.claim,
-            base_version=work.base_version,
-            tile=new if is_new else None,
-            report_ids=_ids(work),
-            voxel_reports=provenance_of([*folded, now]),
+        return replace(
+            self._publication(work, new, len(new.gaussians), named, closed),
+            voxel_reports=provenance_of(merges),
             waiting=now.gated.waiting,
-            shift_tests=tuple(test for one in (*folded, now) for test in one.believed.tests),
+            shift_tests=tuple(test for one in merges for test in one.believed.tests),
             courses=courses_of(one for reports in by_window.values() for one in reports),
-            basis=Basis(journal.window, journal.seq, named, self._parameters),
             memory=encode_state(tile, closed[-1], state) if closed else None,
-            closed=tuple(closed),
         )
 
     def _of_features(self, work: TileWork) -> Publication:
-        """The same of a tile of a feature layer."""
+        """Of a tile of a feature layer."""
         layer, tile, journal = work.claim.layer, work.claim.tile, work.journal
         epoch = () if work.epoch is None else work.epoch.decode_features().features
-        state = LayerState.stored(epoch, journal.memory)
         rows = [row for row in work.reports if self._readable(row, said_of) is not None]
         named = names_of(self._store.refuted_reports(layer, {row.vehicle for row in rows}), rows)
-        merger = LayerMerger(tile, self._config.features, self._feature_bases(work), refuted_of(named))
-        by_window = windows_of(rows)
-        closed = [window for window in by_window if window < journal.window]
-        merges = []
-        for window in closed:
-            merges.append(merger.merge(state, by_window[window]))
-            state = merger.fold(state, merges[-1], by_window[window])
-        now = merger.merge(state, by_window.get(journal.window))
-        merges.append(now)
-        new = FeatureTile(tile, work.base_version + 1, now.features)
-        is_new = new.sha != work.head.sha if work.head else len(now.features) > 0
+        merger = LayerMerger(tile, self._config.merge_of(layer), self._feature_bases(work), refuted_of(named))
+        state, merges, closed = _through_windows(
+            LayerState.stored(epoch, journal.memory), windows_of(rows), journal.window, merger.merge, merger.fold
+        )
+        new = FeatureTile(tile, work.base_version + 1, merges[-1].features)
+        return replace(
+            self._publication(work, new, len(new.features), named, closed),
+            voxel_reports={feature: ids for one in merges for feature, ids in one.provenance.items()},
+            shift_tests=tuple(test for one in merges for test in one.tests),
+            memory=state.encoded(closed[-1]) if closed else None,
+        )
+
+    def _publication(
+        self, work: TileWork, new: AnyTile, size: int, named: frozenset[str], closed: Sequence[int]
+    ) -> Publication:
+        """What both kinds of tiles publish; the tile is None where the head has that content."""
+        is_new = new.sha != work.head.sha if work.head else size > 0
         return Publication(
             claim=work.claim,
             base_version=work.base_version,
             tile=new if is_new else None,
-            report_ids=_ids(work),
-            voxel_reports={feature: ids for one in merges for feature, ids in one.provenance.items()},
-            shift_tests=tuple(test for one in merges for test in one.tests),
-            basis=Basis(journal.window, journal.seq, named, self._parameters),
-            memory=state.encoded(closed[-1]) if closed else None,
+            report_ids=tuple(row.report_id for row in work.reports),
+            basis=Basis(work.journal.window, work.journal.seq, named, self._parameters),
             closed=tuple(closed),
         )
 
@@ -228,5 +227,21 @@ def in_turn(claims: Sequence[Claim]) -> Iterator[Sequence[Claim]]:
         yield first
 
 
-def _ids(work: TileWork) -> tuple[str, ...]:
-    return tuple(row.report_id for row in work.reports)
+def _through_windows(
+    state: StateT,
+    by_window: Mapping[int, ReportsT],
+    open_window: int,
+    merge: Callable[[StateT, ReportsT | None], MergedT],
+    fold_in: Callable[[StateT, MergedT, ReportsT], StateT],
+) -> tuple[StateT, list[MergedT], list[int]]:
+    """Fold the windows that are closed into the state, then merge the open one.
+
+    Returns:
+        The state before the open window; what each window was merged to, the open one last; the closed windows.
+    """
+    closed, merges = [window for window in sorted(by_window) if window < open_window], list[MergedT]()
+    for window in closed:
+        merges.append(merge(state, by_window[window]))
+        state = fold_in(state, merges[-1], by_window[window])
+    merges.append(merge(state, by_window.get(open_window)))
+    return state, merges, closed

@@ -1,12 +1,9 @@
-"""`gnd chaos`: hurt a whole cloud of real processes in every way that a seed draws, and see if it keeps its word."""
+"""`gnd chaos`: inject seeded faults into a whole cloud of real processes, and check its guarantees."""
 
 import json
-import signal
+import shutil
 import tempfile
-import threading
-from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
 
 import click
@@ -14,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gnd.deploy.errors import ChaosError
+from gnd.deploy.interruption import ending_in_order
 
 if TYPE_CHECKING:
     from gnd.deploy.chaos.run import ChaosOutcome
@@ -28,10 +26,10 @@ WIDTH = 120
 @click.option("--json", "json_file", type=PATH, help="Write the outcome to this file; - prints it.")
 @click.option("--out", type=PATH, help="Keep store, outboxes and logs in this folder.  [default: only if it failed]")
 def chaos(kills: int, seed: int, json_file: Path | None, out: Path | None) -> None:
-    """Kill, stop, cut off and mislead the parts of a cloud and its clients while they work; then check what is left.
+    """Inject faults into the parts of a cloud and its clients while they work; then check what is left.
 
-    Ends with 1 where a report was lost or doubled, a tile torn or stuck, or the map is not what its journal gives.
-    Ctrl-C ends the faults; what was found until then is checked and printed.
+    The exit code is 1 if a report was lost or duplicated, a tile is torn or stuck, or the map differs from its journal.
+    Ctrl-C ends the faults; everything up to then is checked and printed.
     """
     # The heavy imports wait until the options have been found good.
     from gnd.deploy.chaos.faults import plan
@@ -40,23 +38,19 @@ def chaos(kills: int, seed: int, json_file: Path | None, out: Path | None) -> No
 
     console = Console(stderr=True)
     folder = _folder(out)
-    stop = _stop_on_interrupt()
-    with ExitStack() as stack:
-        progress = stack.enter_context(progress_bars(console))
+    with ending_in_order() as stop, progress_bars(console) as progress:
         task = progress.add_task("starting", total=kills)
         outcome = run_chaos(
             seed, plan(seed, kills), folder, stop,
             lambda what, n: progress.update(task, description=what, completed=n),
         )  # fmt: skip
-    told = json.dumps(outcome.as_dict(), indent=2)
-    if json_file is not None and str(json_file) != "-":
-        json_file.write_text(told + "\n", encoding="utf-8")
-    if str(json_file) == "-":
-        click.echo(told)
-    else:
+    if json_file is not None:
+        with click.open_file(str(json_file), "w", encoding="utf-8") as file:
+            file.write(json.dumps(outcome.as_dict(), indent=2) + "\n")
+    if str(json_file) != "-":
         print_outcome(Console(width=WIDTH), outcome)
     if out is None and not outcome.failures:
-        _remove(folder)
+        shutil.rmtree(folder)
     else:
         console.print(f"everything else: {folder}", highlight=False, soft_wrap=True)
     if outcome.failures:
@@ -72,26 +66,6 @@ def _folder(out: Path | None) -> Path:
     return out.resolve()
 
 
-def _remove(folder: Path) -> None:
-    for path in sorted(folder.rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    folder.rmdir()
-
-
-def _stop_on_interrupt() -> threading.Event:
-    """An event that Ctrl-C or SIGTERM sets; the second Ctrl-C ends at once."""
-    stop = threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
-    return stop
-
-
 def print_outcome(console: Console, outcome: "ChaosOutcome") -> None:
     """Tables for people: what must be 0, and what each kind of fault cost."""
     told = outcome.as_dict()
@@ -103,9 +77,9 @@ def print_outcome(console: Console, outcome: "ChaosOutcome") -> None:
         "tiles received / torn": f"{told['received_tiles']} / {told['torn_tiles']}",
         "versions merged": told["versions"],
         "stuck": told["stuck_tiles"],
-        "map as its journal gives it": "yes" if told["identical_map"] else f"NO: {told['verify']}",
-        "parts that died by themselves": told["deaths"] or "none",
-        "settled after": "not at all" if told["settled_s"] is None else f"{told['settled_s']:.1f} s",
+        "map agrees with its journal": "yes" if told["identical_map"] else f"NO: {told['verify']}",
+        "parts that ended without a fault": told["deaths"] or "none",
+        "settled after": "never" if told["settled_s"] is None else f"{told['settled_s']:.1f} s",
     }
     for name, value in rows.items():
         table.add_row(name, str(value))

@@ -8,20 +8,23 @@ from typing import Any, Final
 
 import click
 
-from gnd.deploy.compiling import say_once
+from gnd.deploy.compiling import say_progress
 from gnd.extras import explained
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.jit import tell_compiling
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "fleet": ("gnd.deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map heal."),
+    "fleet": ("gnd.deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map being updated."),
     "lab": ("gnd.deploy.lab.command:lab", "Run a fleet over real shaped links in network namespaces (root)."),
-    "load": ("gnd.deploy.load.command:load", "Replay kept drives as many vehicles: does the cloud keep up?"),
-    "chaos": ("gnd.deploy.chaos_cli:chaos", "Hurt a whole cloud of real processes, and check what it promised."),
+    "load": (
+        "gnd.deploy.load.command:load",
+        "Replay reports as those of many vehicles: does the cloud keep up?",
+    ),
+    "chaos": ("gnd.deploy.chaos_cli:chaos", "Inject faults into a whole cloud, and check its guarantees."),
     "watch": ("gnd.deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
     "traffic": (
         "gnd.deploy.traffic_cli:traffic",
-        "Account for every byte of a run against 3G, 4G and 5G; as a page, too.",
+        "Every byte of a run, compared with 3G, 4G and 5G; also as a page.",
     ),
     "map": ("gnd.deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
     "features": ("gnd.deploy.features_cli:features", "Import, export and list feature layers: Lanelet2, GeoJSON, ..."),
@@ -30,9 +33,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive.",
     ),
     "localise": ("gnd.vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
+    "play": ("gnd.deploy.play:play_command", "Publish a recording as a vehicle's drivers would, on topics of ROS 2."),
     "config": ("gnd.deploy.config_cli:config", "Show and check the settings of the programs."),
-    "sim": ("gnd.fleet_sim.cli:sim", "Write and look at simulated worlds and drives."),
-    "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and set ours beside them."),
+    "sim": ("gnd.fleet_sim.cli:sim", "Write and inspect simulated worlds and drives."),
+    "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and compare them with ours."),
     "router": ("gnd.fleet_bus.cli:router", "Run the Zenoh router alone."),
     "store": ("gnd.tile_store.cli:store", "Run the tile server alone."),
     "merger": ("gnd.cloud_merger.cli:merger", "Run one merger shard alone."),
@@ -81,7 +85,7 @@ def gnd() -> None:
 
 def main() -> None:
     """Run the command line; every error of ours becomes one line on standard error and exit code 2."""
-    tell_compiling(say_once())
+    tell_compiling(say_progress())
     try:
         with explained():
             gnd.main(standalone_mode=False)

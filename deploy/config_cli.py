@@ -5,11 +5,11 @@ from typing import Any
 
 import click
 
-from gnd.deploy.configuration_page import programs
+from gnd.deploy.configuration_page import PROGRAMS, settings_class
 from gnd.deploy.errors import DeployError
 from gnd.gnd_map.settings import described, settings_text
 
-_PROGRAM = click.argument("program", type=click.Choice(["agent", "fleet", "merger", "store"]))
+_PROGRAM = click.argument("program", type=click.Choice(list(PROGRAMS)))
 
 
 @click.group()
@@ -21,8 +21,8 @@ def config() -> None:
 @_PROGRAM
 @click.argument("part", default="")
 def show(program: str, part: str) -> None:
-    """The settings of PROGRAM whose names hold PART."""
-    rows = [row for row in described(programs()[program][0]) if part in row.path]
+    """The settings of PROGRAM whose names contain PART."""
+    rows = [row for row in described(settings_class(program)) if part in row.path]
     if not rows:
         raise DeployError(f"no setting of gnd {program} holds {part!r}")
     for row in rows:
@@ -33,22 +33,23 @@ def show(program: str, part: str) -> None:
         )
 
 
-@config.command(short_help="Whether a file of settings can be used.")
+@config.command(short_help="Check a file of settings.")
 @_PROGRAM
 @click.argument("file", type=click.Path(path_type=Path))
 def check(program: str, file: Path) -> None:
-    """Look at FILE as `gnd PROGRAM --config FILE` would, and print the settings that come of it."""
+    """Check FILE as `gnd PROGRAM --config FILE` would, and print the effective settings."""
     click.echo(settings_text(_loaded(program, file)), nl=False)
 
 
 def _loaded(program: str, file: Path) -> Any:
     from gnd.deploy.fleet_config import load_fleet_config
     from gnd.fleet_bus.settings_file import load_settings, read_toml
-    from gnd.vehicle_agent.settings import agent_of
 
     if program == "fleet":
         return load_fleet_config(file, {})
     if program == "agent":
+        from gnd.vehicle_agent.settings import agent_of
+
         return agent_of({"drive": "drive.mcap"} | read_toml(file), where=str(file))
     needed = {"path": "map.sqlite"} if program == "store" and "path" not in read_toml(file) else {}
-    return load_settings(programs()[program][0], program, file, (), needed, {})
+    return load_settings(settings_class(program), program, file, (), needed, {})

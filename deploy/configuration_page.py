@@ -1,5 +1,6 @@
-"""`python -m gnd.deploy.configuration_page`: docs/configuration.md from the code; --check says whether it is so."""
+"""`python -m gnd.deploy.configuration_page` writes docs/configuration.md from the code; --check compares them."""
 
+import importlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +25,7 @@ three options:
 | `--set NAME=VALUE` | replaces one setting, such as `report.longest_s=30`; values as in JSON; repeatable |
 | `--dump-config` | prints the effective settings, exactly as `--config` takes them, and ends |
 
-Where a setting is said more than once, the later one wins:
+If a setting is given more than once, the later one in this list applies:
 
 1. the defaults of this page,
 2. the file,
@@ -33,11 +34,11 @@ Where a setting is said more than once, the later one wins:
 4. `--set`,
 5. the program's own options, such as `--link 4g`.
 
-A name that no setting has is an error that names near ones; a value outside its range is an error with value and
-range. `gnd config check PROGRAM FILE` looks at a file and runs nothing. The effective settings are written beside every
-result: `settings.toml` in the folder of an agent and of a fleet run, and their SHA-256 as `settings_sha256` in
-`result.json` and `summary.json`. A file of the fleet holds those of its agents and shards in the tables `[agent]` and
-`[merger]` (in the environment: `GND_FLEET__AGENT__REPORT__LONGEST_S`; its agents do not read `GND_AGENT__...`):
+An unknown name is an error that lists similar names; a value outside its range is an error with value and
+range. `gnd config check PROGRAM FILE` checks a file without running anything. The effective settings are written beside
+every result: `settings.toml` in the folder of an agent and of a fleet run, and their SHA-256 as `settings_sha256` in
+`result.json` and `summary.json`. A file of the fleet contains those of its agents and shards in the tables `[agent]`
+and `[merger]` (in the environment: `GND_FLEET__AGENT__REPORT__LONGEST_S`; its agents do not read `GND_AGENT__...`):
 
 ```toml
 agents = 4
@@ -49,31 +50,32 @@ longest_s = 30.0
 poll_s = 0.5
 ```
 
-The studies' `--set` (`gnd reproduce simulation --set detect.new_cells=35`) has the same names; those of the merge begin
-with `merge.`. What nobody turns is no setting but a constant beside its use.
+The studies' `--set` (`gnd reproduce simulation --set detect.new_cells=35`) uses the same names; those of the merge
+begin with `merge.`. Values that nobody needs to change are constants in the code.
 """
 
 
-def programs() -> dict[str, tuple[type[Any], str]]:
-    """The programs that take settings: the class of the settings, and what the program does."""
-    from gnd.cloud_merger.config import ShardConfig
-    from gnd.deploy.fleet_config import FleetConfig
-    from gnd.tile_store.cli import TileServerConfig
-    from gnd.vehicle_agent.config import AgentConfig
+PROGRAMS: Final = {
+    "agent": ("gnd.vehicle_agent.config:AgentConfig", "one vehicle"),
+    "fleet": ("gnd.deploy.fleet_config:FleetConfig", "a whole fleet on one machine"),
+    "merger": ("gnd.cloud_merger.config:ShardConfig", "one merger shard"),
+    "store": ("gnd.tile_store.cli:TileServerConfig", "the tile server"),
+}
+"""The programs that take settings: the class of the settings, and what the program does."""
 
-    return {
-        "agent": (AgentConfig, "one vehicle"),
-        "fleet": (FleetConfig, "a whole fleet on one machine"),
-        "merger": (ShardConfig, "one merger shard"),
-        "store": (TileServerConfig, "the tile server"),
-    }
+
+def settings_class(program: str) -> type[Any]:
+    """The settings of a program; only its own packages are imported, so that it needs only its own extra."""
+    module, name = PROGRAMS[program][0].split(":")
+    found: type[Any] = getattr(importlib.import_module(module), name)
+    return found
 
 
 def page() -> str:
     """The page as Markdown."""
     parts = [_HEAD]
-    for name, (cls, what) in programs().items():
-        rows = list(described(cls))
+    for name, (_, what) in PROGRAMS.items():
+        rows = list(described(settings_class(name)))
         parts.append(f"## gnd {name}\n\nSettings of {what}: {len(rows)}.\n\n" + "".join(_table(rows)))
     return "\n".join(parts)
 
@@ -81,14 +83,14 @@ def page() -> str:
 def _table(rows: list[Described]) -> Iterator[str]:
     yield "| name | default | unit | range | effect |\n|---|---|---|---|---|\n"
     for row in rows:
-        told = row.setting
+        setting = row.setting
         default = f"`{row.default}`" if row.default else ""
-        cells = (f"`{row.path}`", default, told.unit, told.range or row.kind, told.effect)
+        cells = (f"`{row.path}`", default, setting.unit, setting.range or row.kind, setting.effect)
         yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
 @click.command()
-@click.option("--check", is_flag=True, help="Write nothing; end with 1 where the page is not what the code says.")
+@click.option("--check", is_flag=True, help="Write nothing; exit code 1 if the page differs from the code.")
 @click.option("--out", type=click.Path(path_type=Path), default=PAGE, show_default=True, help="The page.")
 def main(check: bool, out: Path) -> None:
     """Write the page of settings from the code."""
@@ -96,7 +98,7 @@ def main(check: bool, out: Path) -> None:
     if not check:
         out.write_text(text, encoding="utf-8")
     elif not out.exists() or out.read_text(encoding="utf-8") != text:
-        click.echo(f"{out} is not what the code says: run python -m gnd.deploy.configuration_page", err=True)
+        click.echo(f"{out} differs from the code: run python -m gnd.deploy.configuration_page", err=True)
         sys.exit(1)
 
 

@@ -8,6 +8,7 @@ GndError
     │   └── LabRuns        a lab of that name is running
     ├── PageError          a page cannot be written
     ├── ChaosError         a chaos run cannot start, or its street cannot be read
+    ├── LoadError          a load cannot be made
     └── NoStudies          the papers' results can be reproduced in a checkout only
 """
 
@@ -40,6 +41,10 @@ class PageError(DeployError):
 
 class ChaosError(DeployError):
     """A chaos run cannot start, or its street cannot be read."""
+
+
+class LoadError(DeployError):
+    """A load cannot be made: no drives to replay, or more streets than the Earth has room for."""
 
 
 class NoStudies(DeployError):

@@ -31,7 +31,7 @@ GEOREFERENCE_HELP: Final = (
 def features() -> None:
     """Import, export and list the feature layers of a store: signs, poles, streetlights, lanes, ...
 
-    Files: Lanelet2 (.osm), OpenDRIVE (.xodr, read only), GeoJSON (.geojson), Argoverse 2 maps (log_map_archive_*.json,
+    Files: Lanelet2 (.osm), OpenDRIVE (.xodr), GeoJSON (.geojson), Argoverse 2 maps (log_map_archive_*.json,
     read only).
     """
 
@@ -44,13 +44,14 @@ def features() -> None:
     "--layer", "layers", multiple=True, metavar="KIND=LAYER", help=f"Layer of a kind; {LEFT_OUT}: leave it out."
 )
 @click.option("--other", metavar="LAYER", help="Layer of all kinds without one.  [default: they are left out]")
-@click.option("--source", help="What the file is known by; imported again, it replaces itself.  [default: its name]")
+@click.option("--source", help="Name of the source; importing it again replaces its features.  [default: file name]")
 @click.option("--georeference", metavar="WHERE", help=GEOREFERENCE_HELP)
 @click.option("--poses", type=PATH, help="Track in the local coordinates: 3 x 4 matrices (KITTI).")
 @click.option("--fixes", type=PATH, help="GNSS of that track: lines of LAT LON in degrees.")
 @click.option("--height-offset", default=0.0, metavar="METRES", help="Added to heights, which makes them ellipsoidal.")
 @click.option("--sigma", default=SIGMA_M, show_default=True, metavar="METRES", help="Of positions, each axis.")
-@click.option("--exist", default=SURE, show_default=True, help="Mass of existence of what a map holds.")
+@click.option("--exist", default=SURE, show_default=True, help="Mass of existence of the features of the file.")
+@click.option("--strict", is_flag=True, help="Refuse a file with lines or borders that cross; else they are reported.")
 @click.option("--city", help="Of an Argoverse 2 map: PIT, ...  [default: by the file's name]")
 @json_option
 def import_(
@@ -66,6 +67,7 @@ def import_(
     height_offset: float,
     sigma: float,
     exist: float,
+    strict: bool,
     city: str | None,
     as_json: bool,
 ) -> None:
@@ -77,7 +79,7 @@ def import_(
     format_of(file, kind)  # a wrong name is told before a track is computed
     options = ImportOptions(
         _layers(layers), other, _placement(georeference, poses, fixes), georeference == "latlon", height_offset, sigma,
-        sigma, exist,
+        sigma, exist, strict,
     )  # fmt: skip
     name = source or default_source(file)
     with _Bars() as bars:
@@ -125,16 +127,15 @@ def _anchor(said: str) -> Placement:
 @click.option("--layer", "layers", multiple=True, help="A layer, or several.  [default: all]")
 @region_option
 @click.option("--format", "kind", type=click.Choice(WRITTEN), help="  [default: by the file's name]")
-@click.option(
-    "--source", help="Write into the Lanelet2 file imported as this; '': a new file.  [default: the only one]"
-)
+@click.option("--source", help="Write into the file imported as this; '': a new file.  [default: the only one]")
 @json_option
 def export(
     path: Path, out: Path, layers: tuple[str, ...], region: str, kind: str | None, source: str | None, as_json: bool
 ) -> None:
-    """Write the newest features of STORE to FILE: GeoJSON, or Lanelet2 (.osm).
+    """Write the newest features of STORE to FILE: GeoJSON, Lanelet2 (.osm) or OpenDRIVE (.xodr).
 
-    A Lanelet2 file that was imported comes back with all that is no feature; only what has changed is written anew.
+    A Lanelet2 or OpenDRIVE file that was imported comes back with all that is no feature; only what has changed is
+    written anew. A new Lanelet2 file has the lanes of every source as lanelets.
     """
     with SqliteStore(path, create=False) as store:
         result = export_features(store, out, layers, region, kind, source)
@@ -191,7 +192,7 @@ def _row(feature: MapFeature) -> dict[str, Any]:
 @click.argument("feature_id", metavar="ID", type=int)
 @json_option
 def show_(path: Path, feature_id: int, as_json: bool) -> None:
-    """All that STORE says of the feature ID: as GeoJSON, its tiles, and the reports that it comes from."""
+    """One feature of STORE: as GeoJSON, with its tiles and the reports that it comes from."""
     with SqliteStore(path, create=False) as store:
         found = [one for one in load_features(store) if one.feature_id == feature_id]
         if not found:

@@ -1,5 +1,6 @@
 """The answers of `gnd features` as tables for people."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -17,7 +18,9 @@ def print_import(console: Console, path: str, result: ImportResult) -> None:
     told = {
         "from": f"{result.source} ({result.format})",
         **{f"layer {layer}": f"{n} features" for layer, n in result.features.items()},
+        **_lanes(result.lanes),
         "left out": _counted(result.left_out) or "nothing",
+        **({"kept in the file": _counted(result.kept)} if result.kept else {}),
         "gone since the last import": result.removed,
         "tiles": f"{result.tiles} published, {result.unchanged} unchanged",
     }
@@ -26,14 +29,30 @@ def print_import(console: Console, path: str, result: ImportResult) -> None:
         console.print(note, highlight=False)
 
 
+def _lanes(counts: Mapping[str, int]) -> dict[str, str]:
+    if not counts.get("lanes"):
+        return {}
+    return {
+        "lanes between them": f"{counts['lanes']}, of them {counts['with_successor']} with a successor and "
+        f"{counts['with_neighbour']} with a neighbour"
+    }
+
+
 def print_export(console: Console, result: FeaturesExported) -> None:
     """What an export wrote."""
     console.print(f"{result.path}: {result.features} features, {result.size_bytes / 1e6:.2f} MB", highlight=False)
-    if result.source is not None and result.changes is not None:
-        changes = result.changes
+    changes = result.changes
+    if changes is not None and changes.lanelets:
+        console.print(
+            f"{changes.lanelets} lanelets; ends joined over {changes.joined_m:.3f} m at most, {changes.apart} "
+            f"successors too far apart, {changes.unbounded} lanes left out without a border",
+            highlight=False,
+        )
+    if result.source is not None and changes is not None:
         console.print(
             f"into {result.source}: {changes.moved} nodes and lines moved, {changes.retagged} elements with "
-            f"other tags, {changes.removed} elements removed, {changes.added} features new",
+            f"other tags, {changes.removed} elements removed, {changes.added} features new"
+            + (f", {changes.unwritten} changes that the format cannot say" if changes.unwritten else ""),
             highlight=False,
         )
 

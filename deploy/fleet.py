@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from rich.console import Console
 
@@ -42,6 +43,8 @@ EARLY_S = 3.0
 """A process is started so long before its vehicle, in time of the drives: the others would have to wait for it."""
 LATE = "the agents did not finish"
 WATCHER_GRACE_S = 15.0
+SHARD_DEFAULTS: Final = {"store": {"merge_delay_s": 0.5, "merge_after_reports": 16}}
+"""What a fleet's shards have for the defaults of `gnd merger`: somebody is watching."""
 
 _log = logging.getLogger(__name__)
 
@@ -134,9 +137,7 @@ def cloud_processes(config: FleetConfig, folder: RunFolder, site: SiteFrame) -> 
     connect, where = site.connect, site.namespace
     shards = [shard_config(config, f"shard-{number}", folder.store, connect) for number in range(config.shards)]
     return [
-        ProcessSpec("router", roles.router, (site.listen,), namespace=where),
-        ProcessSpec("store", roles.store, (folder.store, connect), namespace=where),
-        *(ProcessSpec(f"merger-{n}", roles.merger, (shard,), namespace=where) for n, shard in enumerate(shards)),
+        *roles.of_cloud(site.listen, connect, folder.store, shards, where),
         ProcessSpec("watcher", roles.watcher, (connect, folder.updates, config.layers), namespace=where),
     ]
 
@@ -194,17 +195,17 @@ def vehicle_name(number: int) -> str:
 
 def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) -> ShardConfig:
     """Return the configuration of one merger shard."""
-    of_fleet = {
-        "merge": {"mode": config.merge_mode},
-        "store": {"merge_delay_s": config.merge_delay_s, "merge_after_reports": config.merge_after_reports},
-    }
+    of_fleet = {**SHARD_DEFAULTS, "feature_layer": list(config.feature_layer)}
     own = {"shard_id": shard_id, "store_path": str(store), "connect": [connect]}
     return from_settings(ShardConfig, merged(of_fleet, config.merger, own), where="fleet: merger")
 
 
 def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, place: VehicleSite) -> AgentConfig:
     """Return the configuration of one vehicle agent."""
-    of_fleet = {"detect": {"mode": config.detect_mode}, "features": {"layers": list(config.feature_layers)}}
+    of_fleet = {
+        "features": {"layers": list(config.feature_layers)},
+        "feature_layer": list(config.feature_layer),
+    }
     own = {
         "vehicle": vehicle,
         "drive": str(drive),

@@ -18,6 +18,7 @@ from gnd.deploy.ports import claim_port
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from gnd.deploy.site import SiteFrame
 from gnd.deploy.source import Source
+from gnd.extras import need_all
 from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.fleet_bus.settings_options import settings_options
@@ -30,12 +31,12 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 def listed(_context: click.Context, _option: click.Parameter, value: str | None) -> list[str] | None:
-    """Give the words of a comma-separated list."""
+    """Return the items of a comma-separated list."""
     return None if value is None else [word.strip() for word in value.split(",") if word.strip()]
 
 
 def given(_context: click.Context, _option: click.Parameter, values: tuple[str, ...]) -> list[str] | None:
-    """Give what was given of an option that may be repeated; None: nothing."""
+    """Return the values of a repeatable option, or None where it was not given."""
     return list(values) or None
 
 
@@ -56,15 +57,17 @@ RUN_OPTIONS = (
         "wrong_mounts",
         multiple=True,
         callback=given,
-        help="VEHICLE:DEGREES, such as 3:0.5: its drive tells a LiDAR mount turned by so much; may be repeated.",
+        help="VEHICLE:DEGREES, such as 3:0.5: its drive contains a LiDAR mount turned by this angle; repeatable.",
     ),
     click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders), not simulated ones."),
     click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`)."),
     click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs."),
     click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]"),
     click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder."),
-    click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging."),
-    click.option("--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection."),
+    click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging (merger.merge.mode)."),
+    click.option(
+        "--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection (agent.detect.mode)."
+    ),
     settings_options,
     click.option("--keep-drives", is_flag=True, help="Keep the simulated drives (some hundred MB) after the run."),
     click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON."),
@@ -97,16 +100,17 @@ def fleet(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Run a fleet: vehicles download the map, drive, detect changes and upload them; the cloud heals the map.
+    """Run a fleet: vehicles download the map, drive, detect changes and upload them; the cloud updates the map.
 
     Without --drives a street that has changed since it was mapped is simulated, and the result is compared with the
     truth. The folder of the run holds the logs, the traffic ledger and its page,
     the store, three pictures and summary.json.
     """
-    config = load_fleet_config(config_file, options, changes)
+    config = load_fleet_config(config_file, by_part(options), changes)
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return
+    need_all()
     source = Source(drives, base_map, worlds, options["agents"])
     load_link(config.link)  # what cannot work is refused before anything is written
     claim_port(config.port)
@@ -115,6 +119,13 @@ def fleet(
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
     summary = run(config, folder, source, keep_drives=keep_drives)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
+
+
+def by_part(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of the command as settings of a fleet: the two modes are settings of its agents and its shards."""
+    own = dict(options)
+    detect, merge = ({"mode": own.pop(name)} for name in ("detect_mode", "merge_mode"))
+    return own | {"agent": {"detect": detect}, "merger": {"merge": merge}}
 
 
 def run(
@@ -139,6 +150,7 @@ def run(
     """
     # The heavy imports wait until the options have been found good.
     from gnd.deploy import prepare, summary
+    from gnd.deploy.compiling import watched_elsewhere
     from gnd.deploy.fleet import run_fleet
     from gnd.deploy.live import progress_bars
     from gnd.deploy.processes import start_fork_server
@@ -146,10 +158,17 @@ def run(
     console = Console(stderr=True)
     stop, started_s = _stop_on_sigterm(), time.monotonic()
     with progress_bars(console) as progress:
+        compiling = progress.add_task("compiling kernels for this machine (once)", visible=False, total=None)
+
+        def show(ready: int, known: int) -> None:
+            progress.update(compiling, visible=True, completed=ready, total=known)
+
         warm = threading.Thread(target=start_fork_server, name="fork-server")
-        warm.start()  # the kernels are loaded while the world is made
-        prepared = prepare.prepare(config, folder, source, progress)
-        warm.join()
+        with watched_elsewhere(show):
+            warm.start()  # the kernels are loaded while the world is made
+            prepared = prepare.prepare(config, folder, source, progress)
+            warm.join()
+        progress.update(compiling, visible=False)
     prepare_s = time.monotonic() - started_s
     with place() as site:
         outcome = run_fleet(config, folder, prepared, console, stop, site)

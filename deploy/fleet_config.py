@@ -12,6 +12,7 @@ from typing import Any
 from gnd.deploy.errors import DeployError
 from gnd.fleet_bus.settings_file import layers_of
 from gnd.gnd_map.settings import check_settings, from_settings, merged, setting
+from gnd.schemas.feature_layer import LayerParameters, checked_layers
 
 MAX_AGENTS = 200
 MAX_SHARDS = 32
@@ -31,50 +32,43 @@ class FleetConfig:
     link: str = setting("4g", "Link profile of every vehicle: 3g, 4g, 5g, none, or a TOML file.")
     headway_s: float = setting(
         4.0,
-        "Time of the drives between the starts of two vehicles, so that those behind drive on what those "
-        "ahead have found; 0: all start at once, and drive as fast as they can.",
+        "Time (of the drives) between the starts of two vehicles, so that later vehicles use the updates of "
+        "earlier ones; 0: all start at once, and drive as fast as they can.",
         unit="s",
         least=0,
         most=MAX_HEADWAY_S,
     )
     world_seed: int = setting(7, "Seed of the simulated world and of its drives.")
     port: int = setting(0, "TCP port of the router on the loopback interface; 0 takes a free one.", least=0, most=65535)
-    detect_mode: str = setting("default", "Rules of change detection, `default` or `paper`.")
-    merge_mode: str = setting("default", "Rules of merging and publishing, `default` or `paper`.")
-    merge_delay_s: float = setting(
-        0.5,
-        "A tile is merged this long after its first unmerged report ...",
-        unit="s",
-        least=0,
-    )
-    merge_after_reports: int = setting(16, "... or as soon as this many reports wait.", least=1)
     deadline_s: float = setting(1800.0, "A run that takes longer is ended with an error.", unit="s", above=0)
     wrong_mounts: tuple[str, ...] = setting(
         (),
-        'Vehicles whose drives tell a wrong mount, such as "3:0.5": that of vehicle 3 is turned by 0.5 '
-        "degrees (counter-clockwise seen from above) against the one that it was driven with.",
+        'Vehicles whose drives contain a wrong mount, such as "3:0.5": the mount of vehicle 3 is turned by 0.5 '
+        "degrees (counter-clockwise seen from above) against the true one.",
     )
     layers: tuple[str, ...] = setting(
         (VOXEL_LAYER,),
         'Layers of the map that vehicles keep up to date; "ndt", on which they localise, is always among them.',
     )
 
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (), "Feature layers that the user declares, for agents and shards alike."
+    )
     agent: Mapping[str, Any] = setting({}, "Settings of every agent, as `gnd agent --config` takes them.")
     merger: Mapping[str, Any] = setting({}, "Settings of every shard, as `gnd merger --config` takes them.")
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         check_settings(self, DeployError)
-        for name in ("detect_mode", "merge_mode"):
-            value = getattr(self, name)
-            _require(value in ("default", "paper"), f"{name} must be default or paper, got {value!r}")
         _ = self.wrong_mounts_rad
         self._check_layers()
 
     def _check_layers(self) -> None:
-        unfit = [layer for layer in self.layers if layer != VOXEL_LAYER and layer not in FEATURE_LAYERS]
-        known = ", ".join((VOXEL_LAYER, *FEATURE_LAYERS))
-        _require(not unfit, f"no vehicle of the fleet detects the layers {', '.join(unfit)}; it knows {known}")
+        known = (VOXEL_LAYER, *FEATURE_LAYERS, *checked_layers(self.feature_layer))
+        unfit = [layer for layer in self.layers if layer not in known]
+        _require(
+            not unfit, f"no vehicle of the fleet detects the layers {', '.join(unfit)}; it knows {', '.join(known)}"
+        )
         _require(VOXEL_LAYER in self.layers, f"layers must hold {VOXEL_LAYER!r}, on which vehicles localise")
         _require(len(set(self.layers)) == len(self.layers), f"layers {', '.join(self.layers)}: one comes twice")
 
@@ -128,7 +122,7 @@ def load_fleet_config(
 
     Args:
         path: TOML file, or None for the shipped `deploy/fleet.toml`.
-        overrides: values by field name; None means not given.
+        overrides: values by field name, nested by group; None means not given.
         changes: NAME=VALUE, as of --set.
         environment: None: of this process (GND_FLEET__AGENTS=4).
 

@@ -37,7 +37,7 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class FirstStatement:
-    """What a vehicle first said about a tile, and the version that it had of it.
+    """The first report of a vehicle about a tile, and the version of the tile that it had.
 
     Attributes:
         change: the statement.
@@ -51,7 +51,7 @@ class FirstStatement:
 
 
 def first_statements(store: SqliteStore) -> dict[str, dict[TileId, FirstStatement]]:
-    """Return by vehicle and tile what each vehicle first said about each."""
+    """Return the first report of each vehicle about each tile, by vehicle and tile."""
     said: list[tuple[int, str, str, TileChange]] = []
     for row in store.reports():
         report = ChangeReport.decode(row.body)

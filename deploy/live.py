@@ -1,4 +1,4 @@
-"""What a person sees while a fleet runs: a table of the agents, or plain lines where there is no terminal."""
+"""The display of a running fleet: a table of the agents, or plain lines where there is no terminal."""
 
 import math
 import threading
@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from gnd.deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell
+from gnd.deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell, size_text
 from gnd.deploy.map_use import MapUse
 from gnd.fleet_bus.links import LinkProfile
 from gnd.schemas.errors import SchemaError
@@ -76,13 +76,6 @@ class FleetState:
             self.events = [*self.events[-2:], f"{time.strftime('%H:%M:%S')} {text}"]
 
 
-def size_text(size: float) -> str:
-    """Return a number of bytes for people: 812 B, 4.1 kB, 2.35 MB."""
-    if size < 1000:
-        return f"{size:.0f} B"
-    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.2f} MB"
-
-
 def render(state: FleetState, width: int = WIDE) -> Group:
     """Draw the state as tables and a line of totals; less a vehicle where there is no room for a line each.
 
@@ -131,7 +124,7 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
 
 
 def renewed_text(use: MapUse | None) -> str:
-    """What others found of the map under a vehicle's wheels: "80 %, 12 s old"; nothing where that is not known."""
+    """Share of the map under a vehicle that others have updated: "80 %, 12 s old"; empty where unknown."""
     if use is None:
         return ""
     age = f", {use.newest_age_s:.0f} s old" if use.newest_age_s is not None else ""
@@ -139,7 +132,7 @@ def renewed_text(use: MapUse | None) -> str:
 
 
 def doubts_text(sample: TrafficSample) -> str:
-    """What a vehicle takes back or doubts: "4 (2 held back)", and the scans; nothing where it believes itself."""
+    """Tiles in doubt ("4 tiles (2 held back)") and scans taken back; empty where there are none."""
     parts = [f"{sample.tiles_doubtful} tiles ({sample.tiles_held_back} held back)"] if sample.tiles_doubtful else []
     parts += [f"{sample.scans_taken_back} scans"] if sample.scans_taken_back else []
     return ", ".join(parts)
@@ -185,7 +178,7 @@ class LiveView:
             held_back = sum(sample.tiles_held_back for sample in self.state.samples.values())
             doubts = f"{doubtful} tiles doubtful ({held_back} held back); " if doubtful else ""
             on_found = sum(use.renewed_share > 0 for use in self.state.maps.values())
-            found = f"{on_found} on what others found; " if on_found else ""
+            found = f"{on_found} use updates of others; " if on_found else ""
             return (
                 f"{len(self.state.samples)} agents, {driven_m:.0f} m driven, {self.state.reports} reports, "
                 f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates; "

@@ -96,6 +96,13 @@ def rate_between(older: AgentTraffic, older_s: float, newer: AgentTraffic, newer
     return Rate(max(up, 0) / passed_s, max(down, 0) / passed_s, newer_s)
 
 
+def size_text(size: float) -> str:
+    """Return a number of bytes for people: 812 B, 4.1 kB, 2.35 MB."""
+    if size < 1000:
+        return f"{size:.0f} B"
+    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.2f} MB"
+
+
 def rate_cell(rate: Rate | None, link: LinkProfile, direction: Literal["up", "down"], now_s: float) -> str:
     """The rate and its share of the link: 34.1 kB/s 0.2 %; a rate of long ago is none."""
     if rate is None or now_s - rate.at_s > _OLD_S:

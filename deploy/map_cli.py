@@ -27,9 +27,9 @@ MODES: Final = ("auto", "always", "never")
 @click.argument("drives", nargs=-1, required=True, type=PATH)
 @click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
 @click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=CODEC_HELP)
-@click.option("--keep-movers", is_flag=True, help="What moves, and the vehicle itself, stay in the map.")
+@click.option("--keep-movers", is_flag=True, help="Keep points on moving objects and on the vehicle itself.")
 @click.option("--refine-poses", "refine", default="auto", show_default=True, type=click.Choice(MODES), help=REFINE_HELP)
-@click.option("--report", type=PATH, help="Write what the map is worth as a page (one HTML file).")
+@click.option("--report", type=PATH, help="Write the quality of the map as a page (one HTML file).")
 @layer_option
 @json_option
 def build(
@@ -48,7 +48,8 @@ def build(
     poses from odometry do, loops are closed first; several drives become one map. What is out of bounds is said.
     """
     # loaded here: they load numba, gtsam and matplotlib, which the other commands do without
-    from gnd.deploy.map_page import check_writable, write_map_page
+    from gnd.deploy.html_page import check_writable
+    from gnd.deploy.map_page import write_map_page
     from gnd.vehicle_agent.map_build.build import build_recorded_map
     from gnd.vehicle_agent.map_build.quality import measure
     from gnd.vehicle_agent.map_build.result import summary

@@ -1,16 +1,13 @@
-"""The quality of a map as one HTML file: no script, nothing from elsewhere, readable on a phone, light and dark."""
+"""The quality of a map as a page."""
 
 import base64
-import contextlib
-import os
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from gnd.deploy.errors import PageError
+from gnd.deploy.html_page import card_list, document, section, write_html
 from gnd.deploy.map_page_pictures import height_picture, map_picture, thickness_picture
-from gnd.deploy.traffic_page_style import STYLE
 from gnd.vehicle_agent.map_build.build import BuiltMap
 from gnd.vehicle_agent.map_build.quality import MOST_DOUBLED_ROAD, MOST_DOUBLED_WALLS, MOST_THICK_M, Quality
 from gnd.vehicle_agent.map_build.refine_poses import PassDrift
@@ -24,8 +21,6 @@ border-radius:.3rem}
 p.fine{border-left:.3rem solid var(--down);background:var(--card);padding:.5rem .8rem;border-radius:.3rem}
 td.t{white-space:normal}
 """
-_HEAD: Final = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">"""
 _DOUBLE: Final = f"""<p>A surface is doubled when two thin layers of points lie side by side, 0.2 to 1 m apart, over
 most of a voxel: what two passes leave whose poses disagree. Some are real (a sign before a wall, a bonnet
 over the road); more than {MOST_DOUBLED_WALLS:.0f} of 1,000 walls or {MOST_DOUBLED_ROAD:.0f} of 1,000 pieces of road are
@@ -37,36 +32,22 @@ def page(title: str, built: BuiltMap, quality: Quality) -> str:
     """The page of a map as HTML."""
     told = summary(built, quality)
     name = f"Map {escape(title)}"
-    body = "\n".join(
+    return document(
+        name,
         (
             f"<header><h1>{name}</h1><p>{told['drives']} drives, {told['quality']['way_m'] / 1000:.2f} km, "
             f"{told['scans']} scans, {told['tiles']} tiles, {told['gaussians']:,} voxels</p></header>",
             _warnings(quality.warnings),
             _cards(told),
-            _section("From above", _figure(map_picture(built, quality), "Planes by thickness, ways, doubled surfaces")),
-            _section("Doubled surfaces and thick planes", _DOUBLE + _surfaces(told["quality"])),
-            _section("", _figure(thickness_picture(quality), "Thickness of planes")),
-            _section("Poses", _poses(built)),
-            _section("By drive", _drives(told["by_drive"])),
-            _section("The LiDAR over the road", _figure(height_picture(built, quality), "Height along the way")),
-        )
+            section("From above", _figure(map_picture(built, quality), "Planes by thickness, ways, doubled surfaces")),
+            section("Doubled surfaces and thick planes", _DOUBLE + _surfaces(told["quality"])),
+            section("", _figure(thickness_picture(quality), "Thickness of planes")),
+            section("Poses", _poses(built)),
+            section("By drive", _drives(told["by_drive"])),
+            section("The LiDAR over the road", _figure(height_picture(built, quality), "Height along the way")),
+        ),
+        _MORE_STYLE,
     )
-    return (
-        f'<!doctype html>\n<html lang="en"><head>{_HEAD}<title>{name}</title><style>{STYLE}{_MORE_STYLE}</style></head>'
-        f"\n<body><main>\n{body}\n</main></body></html>\n"
-    )
-
-
-def check_writable(path: Path) -> None:
-    """Refuse a place that cannot hold the page, before the long work.
-
-    Raises:
-        PageError: it is a folder, or lies in none.
-    """
-    if path.is_dir():
-        raise PageError(f"cannot write the page {path}: that is a folder, name a file in it")
-    if not path.parent.is_dir():
-        raise PageError(f"cannot write the page {path}: the folder {path.parent} does not exist")
 
 
 def write_map_page(path: Path, title: str, built: BuiltMap, quality: Quality) -> None:
@@ -75,15 +56,7 @@ def write_map_page(path: Path, title: str, built: BuiltMap, quality: Quality) ->
     Raises:
         PageError: the file cannot be written.
     """
-    check_writable(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(page(title, built, quality), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):  # where nothing can be written nothing is left
-            partial.unlink()
-        raise PageError(f"cannot write the page {path}: {error.strerror}") from error
+    write_html(path, page(title, built, quality))
 
 
 def _warnings(warnings: Sequence[str]) -> str:
@@ -106,7 +79,7 @@ def _cards(told: dict[str, Any]) -> str:
         (_share(told["scans_skipped"], told["scans"] + told["scans_skipped"]), "scans without a pose"),
         (f"{quality['voxels_with_points']:,}", f"voxels with points, {told['gaussians']:,} dense enough"),
     )
-    return f'<ul class="cards">{"".join(f"<li><b>{value}</b><span>{what}</span></li>" for value, what in rows)}</ul>'
+    return card_list(rows)
 
 
 def _surfaces(quality: dict[str, Any]) -> str:
@@ -188,8 +161,3 @@ def _figure(png: bytes, caption: str) -> str:
         f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
-
-
-def _section(title: str, content: str) -> str:
-    head = f"<h2>{title}</h2>\n" if title else ""
-    return f"<section>{head}{content}</section>"

@@ -1,4 +1,4 @@
-"""The map under the wheels of vehicles: how much of it others have renewed, and how long ago."""
+"""The map that vehicles used: how much of it others have updated, and how long before."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -14,8 +14,7 @@ import gnd.tile_store.server
 import gnd.vehicle_agent.agent
 import gnd.vehicle_agent.features.layers
 from gnd.cloud_merger.warm import warm_up as warm_up_cloud
-from gnd.deploy.compiling import say_once
-from gnd.gnd_map.jit import tell_compiling
+from gnd.deploy.compiling import tell_watcher
 from gnd.vehicle_agent.warm import warm_up
 
 __all__ = ["gnd"]
@@ -28,7 +27,7 @@ def _compile_in_a_child() -> None:
         os.waitpid(child, 0)
         return
     try:
-        tell_compiling(say_once())
+        tell_watcher()
         warm_up()
         warm_up_cloud()  # for its workers, processes of their own: they shall not compile while vehicles drive
     finally:

@@ -152,7 +152,7 @@ def prepare_recorded(config: FleetConfig, folder: RunFolder, source: Source) -> 
     """
     found = find_drives(source.drives)
     for drive in found:
-        read_header(drive)  # a broken file is refused before any process starts
+        read_header(drive).check_placed()  # a broken file is refused before any process starts
     if source.base_map is not None:
         copy_store(source.base_map, folder.store)
     count = len(found) if source.agents is None else config.agents

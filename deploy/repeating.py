@@ -1,4 +1,4 @@
-"""Work that is done again and again beside what a block does."""
+"""Periodic work in a thread beside a block."""
 
 import threading
 from collections.abc import Callable, Iterator

@@ -1,9 +1,11 @@
-"""What each process of a fleet run does: one module-level function a role, so that a fork server can call it."""
+"""The roles of the processes of a fleet run: module-level functions, so that a fork server can call them."""
 
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 from gnd.cloud_merger.merger import ShardConfig, run_shard
+from gnd.deploy.processes import ProcessSpec
 from gnd.deploy.watch import record_updates
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -12,6 +14,25 @@ from gnd.gnd_map.region import Region
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.agent import AgentConfig, run_agent
+
+
+def of_cloud(
+    listen: str, connect: str, path: Path, shards: Sequence[ShardConfig], namespace: str | None = None
+) -> list[ProcessSpec]:
+    """The processes of a cloud in the order of their start: router, tile server, and a shard for each configuration.
+
+    Args:
+        listen: endpoint that the router opens.
+        connect: the same as the other processes reach it.
+        path: of the store.
+        shards: their processes are merger-0, merger-1 ...
+        namespace: of network, that all of them enter; None stays in the launcher's.
+    """
+    return [
+        ProcessSpec("router", router, (listen,), namespace=namespace),
+        ProcessSpec("store", store, (path, connect), namespace=namespace),
+        *(ProcessSpec(f"merger-{n}", merger, (shard,), namespace=namespace) for n, shard in enumerate(shards)),
+    ]
 
 
 def router(listen: str, *, stop: threading.Event) -> None:

@@ -17,7 +17,7 @@ from gnd.tile_store.options import PATH, json_option, layer_option, show, to_rea
 from gnd.tile_store.values import StoredMemory
 
 
-@click.command(short_help="What a tile remembers: when voxels were last observed, by how many, how sure they are.")
+@click.command(short_help="The memory of a tile: last observation, observers and confidence of its voxels.")
 @click.argument("path", metavar="STORE", type=PATH)
 @click.argument("tile")
 @layer_option

@@ -33,11 +33,11 @@ _WIDTH: Final = 110
     help="Profile to compare with, or a TOML file (FILE or FILE:NAME).",
 )
 def traffic(run: Path, as_json_: bool, as_csv_: bool, page: Path | None, links: tuple[str, ...]) -> None:
-    """Show what RUN (a folder, or a name below runs/) sent and received, and what mobile links make of it.
+    """Show what RUN (a folder, or a name below runs/) sent and received, and compare it with mobile links.
 
     Every byte on the wire is accounted for: by kind of message, and what the connections themselves cost
-    (acks: packets without data, those that answer tiles apart; resent; opening and closing of connections; keep-alives;
-    session: declarations and what else is left).
+    (acks: packets without data, those that answer tiles separately; resent; opening and closing of connections;
+    keep-alives; session: declarations and the remainder).
     """
     if as_json_ and as_csv_:
         raise click.UsageError("--json and --csv exclude each other: one output, one form")

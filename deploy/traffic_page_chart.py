@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Final
 
-from gnd.deploy.live import size_text
+from gnd.deploy.live_traffic import size_text
 from gnd.fleet_bus.ledger import Direction
 from gnd.fleet_bus.links import LinkProfile
 from gnd.fleet_bus.traffic import AgentTraffic

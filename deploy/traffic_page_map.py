@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from gnd.deploy.live import size_text
+from gnd.deploy.live_traffic import size_text
 from gnd.fleet_bus.traffic import TileTraffic
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile_id import TileId

@@ -5,7 +5,8 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from gnd.deploy.live import size_text
+from gnd.deploy.html_page import card_list
+from gnd.deploy.live_traffic import size_text
 from gnd.fleet_bus.links import LinkProfile
 from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, is_of_tiles, per_km
 
@@ -32,9 +33,7 @@ def cards(agents: Sequence[AgentTraffic]) -> str:
         (size_text(up), "up on the wire"),
         (extra, "of the wire is not payload"),
     )
-    return (
-        '<ul class="cards">' + "".join(f"<li><b>{value}</b><span>{what}</span></li>" for value, what in items) + "</ul>"
-    )
+    return card_list(items)
 
 
 def kinds_table(agents: Sequence[AgentTraffic]) -> str:

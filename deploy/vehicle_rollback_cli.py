@@ -1,4 +1,4 @@
-"""`gnd map rollback STORE vehicle:NAME`: take back what one vehicle has said; other targets are the store's own."""
+"""`gnd map rollback STORE vehicle:NAME`: remove the reports of one vehicle; other targets are the store's own."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -19,12 +19,12 @@ PREFIX = "vehicle:"
 _OLD = "Of the shards, where the store does not say: it was merged by an older release."
 
 
-@click.command(short_help="Bring tiles back to an older state, or take back a vehicle's word.")
+@click.command(short_help="Restore an older state of tiles, or remove the reports of a vehicle.")
 @click.argument("path", metavar="STORE", type=PATH)
 @click.argument("place", metavar="TILE|REGION|vehicle:NAME")
 @click.argument("version", type=int, required=False)
 @click.option("--to", help="A version of the tile (3), or a time (2026-01-31T12:00:00Z).")
-@click.option("--dry-run", is_flag=True, help="Only say what would change.")
+@click.option("--dry-run", is_flag=True, help="Only list what would change.")
 @click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=_OLD)
 @layer_option
 @json_option

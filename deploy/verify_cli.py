@@ -17,16 +17,16 @@ from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 _OLD: Final = "Of the shards, where the store does not say: it was merged by an older release."
 
 
-@click.command(short_help="Compute versions anew from what was reported, and compare.")
+@click.command(short_help="Recompute versions from the reports, and compare.")
 @click.argument("path", type=PATH)
 @layer_option
 @region_option
-@click.option("--all-versions", is_flag=True, help="Every version that is kept, not the newest of each tile only.")
+@click.option("--all-versions", is_flag=True, help="Every stored version, not only the newest of each tile.")
 @click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=_OLD)
 @click.option("--merge-mode", default="default", show_default=True, type=click.Choice(("default", "paper")), help=_OLD)
 @json_option
 def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, merge_mode: Any, as_json: bool) -> None:
-    """Compute the tiles of store PATH anew from their journals and compare them bit for bit.
+    """Recompute the tiles of store PATH from their journals and compare them bit for bit.
 
     Each window is merged with the parameters that its shard had, which the store keeps.
 

@@ -9,7 +9,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -20,13 +19,14 @@ from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
-from gnd.schemas.keys import catalog_keys, update_keys
-from gnd.schemas.tiles import Catalog
-from gnd.schemas.updates import TileUpdate
+from gnd.tile_client.fetching import TileServerClient
+from gnd.tile_client.following import NewVersion, RegionFollower
+from gnd.tile_client.notices import Notice
 
 LAYER: Final = "ndt"
 CATALOG_PERIOD_S: Final = 3.0
 CATALOG_TIMEOUT_S: Final = 5.0
+_POLL_S: Final = 0.2
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class WatchEvent:
         reason: why: merged, base, rollback; or catalog when the notice itself was missed.
         put: voxels (of a feature layer: features) written by this version, None where the notice carried no delta.
         removed: voxels or features removed by this version, likewise.
-        size: bytes of the notice.
+        size: bytes of the notice; 0 where it was missed.
     """
 
     received_ns: int
@@ -85,69 +85,44 @@ class TileWatch:
     def __init__(
         self, bus: Bus, region: Region, emit: Callable[[WatchEvent], None], layers: Sequence[str] = (LAYER,)
     ) -> None:
-        self._bus, self._region, self._emit, self._layers = bus, region, emit, tuple(dict.fromkeys(layers))
-        self._seen: set[tuple[str, int, int]] = set()
-        self._latest: dict[tuple[str, int], int] = {}
-        self._lock = threading.Lock()
+        self._bus, self._region, self._emit = bus, region, emit
+        self._asking = {layer: TileServerClient(bus, layer, CATALOG_TIMEOUT_S) for layer in layers}
+        self._seen: set[tuple[str, TileId, int]] = set()
 
     def run(self, stop: threading.Event) -> None:
         """Follow the region until `stop` is set."""
-        with ExitStack() as subscriptions:
-            for layer in self._layers:
-                keys = update_keys(layer, self._region.prefix)
-                subscriptions.enter_context(self._bus.subscribe(keys, self._on_update, history=True))
-            self._compare_catalogs(report=False)
-            while not stop.wait(CATALOG_PERIOD_S):
-                self._compare_catalogs(report=True)
-
-    def _on_update(self, key: str, payload: bytes) -> None:
+        follower = RegionFollower(self._bus, self._asking, self._region, CATALOG_PERIOD_S, history=True)
         try:
-            update = TileUpdate.decode(payload)
-        except SchemaError as error:
-            _log.warning("unreadable update on %s: %s", key, error)
-            return
-        if update.tile in self._region:
-            self._note(_event_of(update, len(payload)))
-
-    def _note(self, event: WatchEvent) -> None:
-        with self._lock:
-            place = event.layer, event.tile
-            if (*place, event.version) in self._seen:
-                return
-            self._seen.add((*place, event.version))
-            self._latest[place] = max(event.version, self._latest.get(place, 0))
-            self._emit(event)
-
-    def _compare_catalogs(self, *, report: bool) -> None:
-        for layer in self._layers:
-            self._compare_catalog(layer, report=report)
-
-    def _compare_catalog(self, layer: str, *, report: bool) -> None:
-        """Find versions whose notice never came; the first call only learns where the region stands."""
-        for tile, version, size in self._catalog(layer):
-            known = self._latest.setdefault((layer, tile.morton), 0 if report else version)
-            if version > known:
-                self._note(_missed(layer, tile, known, version, size))
-
-    def _catalog(self, layer: str) -> list[tuple[TileId, int, int]]:
-        try:
-            key = catalog_keys(layer, self._region.prefix)
-            replies = self._bus.request_many(key, b"", kind="catalog", timeout_s=CATALOG_TIMEOUT_S)
-        except BusError as error:
+            follower.begin()
+        except (BusError, SchemaError) as error:
             _log.warning("no catalog: %s", error)
-            return []
-        return [
-            (entry.tile, entry.version, len(payload))
-            for _, payload in replies
-            for entry in Catalog.decode(payload).entries
-            if entry.tile in self._region
-        ]
+        while not stop.is_set():
+            try:
+                versions = follower.next(_POLL_S)
+            except (BusError, SchemaError) as error:
+                _log.warning("notice or catalog left out: %s", error)
+                stop.wait(_POLL_S)
+                continue
+            for version in versions:
+                self._note(version, follower.known)
+        follower.close()
+
+    def _note(self, found: NewVersion, known: dict[tuple[str, TileId], int]) -> None:
+        """Emit a version that was not seen before."""
+        place = found.layer, found.tile
+        if (*place, found.version) in self._seen:
+            return
+        self._seen.add((*place, found.version))
+        before = known.get(place, 0)
+        known[place] = max(found.version, before)
+        self._emit(_missed(found, before) if found.notice is None else _event_of(found.notice))
 
 
-def _event_of(update: TileUpdate, size: int) -> WatchEvent:
+def _event_of(notice: Notice) -> WatchEvent:
+    update = notice.update
     put, removed = update.voxels or (None, None)
     return WatchEvent(
-        received_ns=time.time_ns(),
+        received_ns=notice.received_ns,
         layer=update.layer,
         tile=update.tile.morton,
         path=update.tile.path,
@@ -156,12 +131,15 @@ def _event_of(update: TileUpdate, size: int) -> WatchEvent:
         reason=update.reason,
         put=put,
         removed=removed,
-        size=size,
+        size=notice.size_bytes,
     )
 
 
-def _missed(layer: str, tile: TileId, known: int, version: int, size: int) -> WatchEvent:
-    return WatchEvent(time.time_ns(), layer, tile.morton, tile.path, version, known, "catalog", None, None, size)
+def _missed(found: NewVersion, known: int) -> WatchEvent:
+    tile = found.tile
+    return WatchEvent(
+        time.time_ns(), found.layer, tile.morton, tile.path, found.version, known, "catalog", None, None, size=0
+    )
 
 
 def record_updates(

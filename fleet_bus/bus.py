@@ -1,7 +1,7 @@
 """The bus as the rest of the project sees it: the only door to zenoh."""
 
 import threading
-from typing import Self, TypeVar
+from typing import Final, Self, TypeVar
 
 from gnd.fleet_bus import leftovers, requesting, subscribing
 from gnd.fleet_bus.config import BusConfig
@@ -23,6 +23,8 @@ from gnd.fleet_bus.wire import WireBytes
 from gnd.gnd_map.tile_id import TileId
 
 _DEFAULT_RETRY = RetryPolicy()
+PUBLISH_WAIT_S: Final = 10.0
+"""So long a notice waits for a lost router to come back."""
 
 
 _P = TypeVar("_P", bound=Part)
@@ -63,6 +65,11 @@ class Bus:
     def config(self) -> BusConfig:
         """The settings of this session."""
         return self._connection.config
+
+    @property
+    def connection(self) -> Connection:
+        """The session, for other parts of this package."""
+        return self._connection
 
     @property
     def ledger(self) -> Ledger | None:
@@ -156,10 +163,10 @@ class Bus:
         serving = Serving(
             self._connection, keyexpr, handler, complete=complete, workers=workers, kind=kind, beside=beside
         )
-        return self._keep(serving)
+        return self.keep(serving)
 
     def publish(
-        self, key: str, payload: bytes, *, kind: str, tile: TileId | str | None = None, wait_s: float | None = None
+        self, key: str, payload: bytes, *, kind: str, tile: TileId | str | None = None, wait_s: float = PUBLISH_WAIT_S
     ) -> None:
         """Publishes a notice that its receivers can also read again: delivery is not confirmed.
 
@@ -170,19 +177,18 @@ class Bus:
             payload: encoded message.
             kind: ledger kind.
             tile: the tile it is about, for the ledger.
-            wait_s: how long to wait for a router, s; by default `BusConfig.publish_wait_s`.
+            wait_s: how long to wait for a router, s.
 
         Raises:
             NoRouter: there was none, so nothing was published.
             MessageTooLarge, BusClosed.
         """
-        wait_s = self.config.publish_wait_s if wait_s is None else wait_s
         subscribing.publish(self._connection, key, payload, kind=kind, tile=tile, wait_s=wait_s)
 
     def advanced_publisher(self, key: str, *, kind: str = "update", remember: int = 1) -> RecallingPublisher:
         """A publisher of one key that repeats its last `remember` notices to late or interrupted subscribers."""
         self._connection.check_open()
-        return self._keep(RecallingPublisher(self._connection, key, kind=kind, remember=remember))
+        return self.keep(RecallingPublisher(self._connection, key, kind=kind, remember=remember))
 
     def subscribe(
         self,
@@ -205,14 +211,12 @@ class Bus:
             tile_of: tile of a key, for the ledger.
         """
         self._connection.check_open()
-        return self._keep(
-            Subscription(self._connection, keyexpr, callback, history=history, kind=kind, tile_of=tile_of)
-        )
+        return self.keep(Subscription(self._connection, keyexpr, callback, history=history, kind=kind, tile_of=tile_of))
 
     def declare_alive(self, key: str) -> AliveToken:
         """Shows that this process lives, until closed, killed or cut off for longer than the lease."""
         self._connection.check_open()
-        return self._keep(AliveToken(self._connection, key))
+        return self.keep(AliveToken(self._connection, key))
 
     def watch_alive(self, keyexpr: str, callback: OnAlive) -> AliveWatch:
         """Calls back with (key, True) for each token present or new and (key, False) for each that goes.
@@ -220,7 +224,7 @@ class Bus:
         All go when the own connection is lost, and come again with it.
         """
         self._connection.check_open()
-        return self._keep(AliveWatch(self._connection, keyexpr, callback))
+        return self.keep(AliveWatch(self._connection, keyexpr, callback))
 
     def wire(self) -> WireBytes:
         """Bytes on the wire of this session so far, over all its connections; also noted in the ledger."""
@@ -267,7 +271,8 @@ class Bus:
             self.wire()
             self.ledger.flush()
 
-    def _keep(self, part: _P) -> _P:
+    def keep(self, part: _P) -> _P:
+        """Close a part of this session with it."""
         with self._lock:
             self._parts = [other for other in self._parts if not other.is_closed]
             self._parts.append(part)

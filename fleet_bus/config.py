@@ -45,7 +45,6 @@ class BusConfig:
         open_timeout_s: how long `open_bus` tries to reach a router, s.
         patient: whether `open_bus` returns without a router, too, and looks for one as long as it takes: what is
             declared until then is declared when it is found, requests wait for it.
-        publish_wait_s: how long `Bus.publish` waits for a lost router to come back, s.
         max_message_bytes: limit for every message, both directions, bytes.
         max_sessions: how many sessions a router accepts.
         queue_limit: how many received messages may wait for a handler, before some are refused or dropped.
@@ -58,7 +57,6 @@ class BusConfig:
     lease_ms: int = 0
     open_timeout_s: float = 10.0
     patient: bool = False
-    publish_wait_s: float = 10.0
     max_message_bytes: int = MAX_MESSAGE_BYTES
     max_sessions: int = 10_000
     queue_limit: int = 4096

@@ -15,7 +15,7 @@ from gnd.fleet_sim.world_summary import as_text, summary
 
 @click.group()
 def sim() -> None:
-    """Write and look at simulated worlds and drives."""
+    """Write and inspect simulated worlds and drives."""
 
 
 @sim.group()
@@ -42,7 +42,7 @@ def write(file: Path, seed: int, **options: Any) -> None:
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def inspect(file: Path, as_json: bool) -> None:
-    """Print what a world file holds: place, objects, edits by kind and by place along the street."""
+    """Print the content of a world file: place, objects, edits by kind and by place along the street."""
     found = summary(read_world(file))
     click.echo(json.dumps(found) if as_json else as_text(found))
 
@@ -69,7 +69,7 @@ def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
 @world.command("features")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("layers", type=click.Path(path_type=Path))
-@click.option("--mapped-streetlights", default=0.0, show_default=True, help="Share of the lamps that the map holds.")
+@click.option("--mapped-streetlights", default=0.0, show_default=True, help="Share of the lamps that are in the map.")
 def features(file: Path, layers: Path, mapped_streetlights: float) -> None:
     """Write the feature layers of the map before the changes of the world in FILE to LAYERS (JSON)."""
     from gnd.fleet_sim.feature_files import write_feature_layers
@@ -92,10 +92,10 @@ def _note(made: World) -> str:
 @click.option("--sensor", default="VLP-16", show_default=True, help=f"{', '.join(SHORT_NAMES)}, or the model's name.")
 @click.option("--state", type=click.Choice(STATES), default="after", show_default=True)
 @click.option("--reverse", is_flag=True, help="Drive against the street's x.")
-@click.option("--seed", default=0, show_default=True, help="Everything random of the drive.")
+@click.option("--seed", default=0, show_default=True, help="Seed of everything random in the drive.")
 @click.option("--vehicle", default="vehicle-0", show_default=True, help="Pseudonym of the vehicle.")
 @click.option("--cars", default=0.2, show_default=True, help="Share of parking slots that are taken.")
-@click.option("--traffic", type=click.Choice(["none", "urban"]), default="none", show_default=True, help="What moves.")
+@click.option("--traffic", type=click.Choice(["none", "urban"]), default="none", show_default=True, help="Movers.")
 @click.option("--scans", type=int, help="At most so many scans.")
 @click.option("--camera", is_flag=True, help="A camera that detects traffic signs, too.")
 def drive(
@@ -133,7 +133,7 @@ def drive(
 
 @sim.group()
 def road() -> None:
-    """Roads of the feature studies: motorways and a test track, with what detectors see on a drive."""
+    """Roads of the feature studies: motorways and a test track, with the detections of a drive."""
 
 
 @road.command("picture")

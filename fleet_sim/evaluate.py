@@ -122,25 +122,6 @@ def evaluate_maps(truth: Truth, base: Tiles, final: Tiles) -> Evaluation:
     return evaluate(truth, classes_of_maps(truth, base, final))
 
 
-def evaluate_changes(
-    truth: Truth, base: Tiles, changes: Mapping[TileId, tuple[NDArray[np.int32], ClassArray]]
-) -> Evaluation:
-    """Compare reported changes with the truth.
-
-    Args:
-        truth: the truth.
-        base: the map that the reports refer to.
-        changes: by tile, voxel ids int32 (K,) and classes uint8 (K,) of `ChangeClass`. Voxels without a report, or
-            reported as UNMEASURED, are as in the base map.
-    """
-    predicted = classes_of_maps(truth, base, base)
-    for tile, (voxel_id, change_class) in changes.items():
-        said = change_class < len(CLASSES)
-        at = voxel_rows(truth, tile, voxel_id[said])
-        predicted[at[at >= 0]] = change_class[said][at >= 0]
-    return evaluate(truth, predicted)
-
-
 def classes_of_maps(truth: Truth, base: Tiles, final: Tiles) -> ClassArray:
     """Return the classes, uint8 (V,), that two maps assign to the truth's voxels."""
     predicted = np.full(len(truth), int(ChangeClass.EMPTY), dtype=np.uint8)

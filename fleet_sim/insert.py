@@ -14,17 +14,12 @@ from numpy.typing import NDArray
 
 from gnd.fleet_sim.errors import SimError
 from gnd.fleet_sim.raycast import Scene
-from gnd.fleet_sim.shapes import Block, Post, Shape
-from gnd.gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
-from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.tile_id import TileId
+from gnd.fleet_sim.shapes import Shape
 
 FloatArray = NDArray[np.float64]
 
 _REACH_M = 200.0
 """A sensor farther away than this from the objects does not see them."""
-_SPACING_M = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,57 +82,3 @@ class Inserter:
         near = self._scene.holds(T[:, :3, 3])
         met_m[near] = self._scene.cast(T[near, :3, 3], directions[near], _REACH_M)[0]
         return met_m
-
-
-def surface_points(shape: Block | Post, spacing_m: float = _SPACING_M) -> FloatArray:
-    """Return points spread evenly over the sides and the top of an object, float64 (N, 3), frame of the shape.
-
-    The underside is left out: no sensor on a road sees it.
-    """
-    return _block_surface(shape, spacing_m) if isinstance(shape, Block) else _post_surface(shape, spacing_m)
-
-
-def _block_surface(block: Block, spacing_m: float) -> FloatArray:
-    u = _steps(-block.half_x_m, block.half_x_m, spacing_m)
-    v = _steps(-block.half_y_m, block.half_y_m, spacing_m)
-    top_u, top_v = (grid.ravel() for grid in np.meshgrid(u, v))
-    rim_u = np.concatenate([u, u, np.full_like(v, -block.half_x_m), np.full_like(v, block.half_x_m)])
-    rim_v = np.concatenate([np.full_like(u, -block.half_y_m), np.full_like(u, block.half_y_m), v, v])
-    share = np.linspace(0.0, 1.0, max(2, round((block.top_m - block.bottom_m) / spacing_m) + 1))[:, None]
-    rim_top = block.top_m + block.rise_x * rim_u + block.rise_y * rim_v
-    side_z = block.bottom_m + share * (rim_top - block.bottom_m)
-    a = np.concatenate([top_u, np.tile(rim_u, len(share))])
-    b = np.concatenate([top_v, np.tile(rim_v, len(share))])
-    z = np.concatenate([block.top_m + block.rise_x * top_u + block.rise_y * top_v, side_z.ravel()])
-    c, s = np.cos(block.yaw_rad), np.sin(block.yaw_rad)
-    return np.stack([block.x_m + c * a - s * b, block.y_m + s * a + c * b, z], axis=1)
-
-
-def _post_surface(post: Post, spacing_m: float) -> FloatArray:
-    angle = np.linspace(0.0, 2 * np.pi, max(8, round(2 * np.pi * post.radius_m / spacing_m)), endpoint=False)
-    height = _steps(post.bottom_m, post.top_m, spacing_m)
-    radius = _steps(0.0, post.radius_m, spacing_m)
-    side = [(post.radius_m * np.cos(angle), post.radius_m * np.sin(angle), np.full_like(angle, z)) for z in height]
-    lid = [(r * np.cos(angle), r * np.sin(angle), np.full_like(angle, post.top_m)) for r in radius]
-    x, y, z = (np.concatenate(column) for column in zip(*side, *lid, strict=True))
-    return np.stack([post.x_m + x, post.y_m + y, z], axis=1)
-
-
-def _steps(low: float, high: float, spacing_m: float) -> FloatArray:
-    return np.linspace(low, high, max(2, round((high - low) / spacing_m) + 1))
-
-
-def surface_voxels(
-    grid_frame: GridFrame, shapes: Sequence[Block | Post], n_min_cells: int = N_MIN_CELLS
-) -> dict[TileId, Gaussians]:
-    """Return the Gaussians of an object's surface by tile: the voxels that it occupies, whoever sees them.
-
-    Args:
-        grid_frame: its frame is the frame of the shapes.
-        shapes: what the object is made of, map frame.
-        n_min_cells: occupied sub-cells from which on a voxel counts.
-    """
-    accumulator = VoxelAccumulator(grid_frame)
-    for shape in shapes:
-        accumulator.add(surface_points(shape))
-    return accumulator.finish(n_min_cells)

@@ -6,7 +6,6 @@ walk up and down free stretches of the pavements, stand now and then, and some c
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 from math import isfinite, pi, tau
 from typing import Final
 
@@ -171,8 +170,3 @@ def _car(world: World, direction: Direction, way_m: FloatArray, style: int, phas
     track = np.stack([x, y, world.road_height_m(y), yaw, np.zeros_like(x)], axis=1)
     shapes = parts.car(0.0, 0.0, 0.0, 0.0, style)
     return Mover(shapes, (0.0,) * len(shapes), track)
-
-
-def least_gap_m(ways_m: FloatArray) -> float:
-    """Return the least distance between bumpers in a lane, from ways float64 (S, N), falling [m]."""
-    return min((float((a - b).min()) - _CAR_M for a, b in pairwise(ways_m.T)), default=float("inf"))

@@ -10,9 +10,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 _PLAIN: Final[dict[str, Any]] = {"cache": True, "error_model": "numpy", "nogil": True}
 # numba's own name for it. A version without it would refuse it at the first call, not go on slower.
 _BARE: Final[dict[str, Any]] = {**_PLAIN, "_nrt": False}
+_PASTED: Final[dict[str, Any]] = {"inline": "always", "error_model": "numpy"}
 _MAKING: Final = Lock()
 _TELL: Final[list[Callable[[str], None]]] = []
 _listening: Final[list[bool]] = []
+_KERNELS: Final[list["LazyKernel"]] = []
 
 
 def tell_compiling(tell: Callable[[str], None]) -> None:
@@ -20,6 +22,13 @@ def tell_compiling(tell: Callable[[str], None]) -> None:
     machine code of it yet, and the first of them take seconds. Loads nothing.
     """
     _TELL.append(tell)
+
+
+def kernels_ready() -> tuple[int, int]:
+    """How many kernels have machine code in this process, compiled or from the disk, and how many there are in the
+    modules that are imported; not every command needs all of them.
+    """
+    return sum(kernel.is_ready for kernel in _KERNELS), len(_KERNELS)
 
 
 def _listen() -> None:
@@ -51,6 +60,13 @@ class LazyKernel:
         update_wrapper(self, function)
         self._function, self._options = function, options
         self._dispatcher: Any = None
+        if options is not _PASTED:
+            _KERNELS.append(self)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is machine code for some types of its arguments."""
+        return self._dispatcher is not None and bool(self._dispatcher.signatures)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Call the compiled kernel."""
@@ -113,7 +129,7 @@ def bare_inlined(function: F) -> F:
 
 def pasted(function: F) -> F:
     """Laid into its callers before their types are known: for a part of a kernel that itself is no kernel."""
-    return _lazy(function, {"inline": "always", "error_model": "numpy"})
+    return _lazy(function, _PASTED)
 
 
 def _lazy(function: F, options: dict[str, Any]) -> F:

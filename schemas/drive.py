@@ -15,7 +15,7 @@ import numpy.typing as npt
 from gnd.gnd_map.arrays import F32, F64, I64, check_array
 from gnd.gnd_map.geodesy import LocalFrame, check_geodetic
 from gnd.schemas import limits
-from gnd.schemas.errors import BadValue
+from gnd.schemas.errors import BadValue, NoPlace
 from gnd.schemas.looks import LOOK_SENSORS as LOOK_SENSORS
 from gnd.schemas.looks import Detections as Detections
 from gnd.schemas.looks import LaneLook as LaneLook
@@ -41,6 +41,9 @@ are zero. none: nobody knows; offsets are zero and the vehicle's motion during a
 """
 MountSource = Literal["unsaid", "given", "estimated", "assumed"]
 """Where the mount comes from: the recording gives it, it was estimated from the scans, or nothing is known."""
+
+StandIn = Literal["gnss", "motion"]
+"""What a drive may hold without having measured it."""
 
 _RIGID_TOLERANCE: Final = 1e-6
 _TIME_BITS: Final = 63
@@ -93,6 +96,10 @@ class DriveHeader:
     """Where `T_vehicle_lidar` comes from; see `MountSource`."""
     mount_sigma: MountSigma | None = None
     """How far the mount is known, where it was estimated."""
+    nowhere: bool = False
+    """The place on the Earth is not known: `anchor` stands for no place, and no shared map may take the drive."""
+    stand_ins: tuple[StandIn, ...] = ()
+    """What was not measured but computed from the poses: errors against them say nothing about these."""
 
     def __post_init__(self) -> None:
         check_text("drive id", self.drive_id, VEHICLE_PATTERN)
@@ -101,6 +108,8 @@ class DriveHeader:
         check_rigid("T_vehicle_lidar", self.T_vehicle_lidar)
         _check_known("deskew", self.deskew, get_args(Deskew))
         _check_known("mount", self.mount, get_args(MountSource))
+        for stand_in in self.stand_ins:
+            _check_known("stand-in", stand_in, get_args(StandIn))
         check_unsigned("sweep time", self.sweep_ns, bits=_TIME_BITS)
         if (self.mount_sigma is not None) != (self.mount == "estimated"):
             raise BadValue(f"mount {self.mount!r} with sigma {self.mount_sigma}: an estimated mount has one, no other")
@@ -115,7 +124,15 @@ class DriveHeader:
     @property
     def _scalars(self) -> tuple[object, ...]:
         told = self.drive_id, self.vehicle, self.sensor_model, self.anchor, self.source
-        return (*told, self.deskew, self.sweep_ns, self.mount, self.mount_sigma)
+        return (*told, self.deskew, self.sweep_ns, self.mount, self.mount_sigma, self.nowhere, self.stand_ins)
+
+    def check_placed(self) -> None:
+        """`NoPlace` where the drive does not tell where on the Earth it was recorded."""
+        if self.nowhere:
+            raise NoPlace(
+                f"drive {self.drive_id} was imported with --nowhere: its place on the Earth is not known, so no shared"
+                " map may take it; import it again with --anchor LAT,LON,HEIGHT or with --poses that tell the place"
+            )
 
     def _same_mount(self, other: "DriveHeader") -> bool:
         return np.array_equal(self.T_vehicle_lidar, other.T_vehicle_lidar)

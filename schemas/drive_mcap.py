@@ -98,6 +98,7 @@ _LIMITS: Final[Mapping[str, int]] = {
     DETECTIONS_TOPIC: limits.MAX_DETECTIONS_BYTES,
     LANES_TOPIC: limits.MAX_LANE_LOOK_BYTES,
 }
+_MOST_BYTES: Final = 1 << 28
 _ITEMS: Final[Mapping[str, Callable[[Any], DriveItem]]] = {
     POINTS_TOPIC: scan_of,
     MOTION_TOPIC: motion_of,
@@ -106,6 +107,9 @@ _ITEMS: Final[Mapping[str, Callable[[Any], DriveItem]]] = {
     DETECTIONS_TOPIC: detections_of,
     LANES_TOPIC: lanes_of,
 }
+
+
+ITEM_TOPICS: Final = tuple(_ITEMS)
 
 
 class DriveWriter:
@@ -260,7 +264,15 @@ def read_drive(path: Path | str) -> Iterator[DriveItem]:
     with open_mcap(Path(path)) as (reader, summary):
         _check_channels(summary)
         for _, channel, message in reader.iter_messages(topics=list(_ITEMS)):
-            yield _decode(channel.topic, message.data)
+            yield item_of(channel.topic, message.data)
+
+
+def topics_of(path: Path | str) -> list[str]:
+    """Those of `ITEM_TOPICS` of which a drive has messages; `DriveError`."""
+    with open_mcap(Path(path)) as (_, summary):
+        counts = summary.statistics.channel_message_counts if summary.statistics is not None else {}
+        found = {channel.topic for channel_id, channel in summary.channels.items() if counts.get(channel_id)}
+    return [topic for topic in ITEM_TOPICS if topic in found]
 
 
 def load_track(path: Path | str) -> DriveTrack:
@@ -268,7 +280,7 @@ def load_track(path: Path | str) -> DriveTrack:
     with open_mcap(Path(path)) as (reader, summary):
         _check_channels(summary)
         items = [
-            _decode(channel.topic, message.data)
+            item_of(channel.topic, message.data)
             for _, channel, message in reader.iter_messages(topics=[MOTION_TOPIC, GNSS_TOPIC, REFERENCE_TOPIC])
         ]
     return track_of(items)
@@ -307,12 +319,30 @@ def drive_counts(path: Path | str) -> DriveCounts:
         )
 
 
-def _decode(topic: str, data: bytes) -> DriveItem:
-    if topic in _LIMITS:
-        return _ITEMS[topic](parse(_MESSAGES[topic], data, _LIMITS[topic]))
-    message = _MESSAGES[topic]()
-    message.ParseFromString(data)
-    return _ITEMS[topic](message)
+def item_of(topic: str, data: bytes) -> DriveItem:
+    """The item of a message on a topic of `ITEM_TOPICS`.
+
+    Raises:
+        SchemaError: it is none.
+    """
+    return _ITEMS[topic](parse(_MESSAGES[topic], data, _LIMITS.get(topic, _MOST_BYTES)))
+
+
+def message_of(item: DriveItem) -> tuple[str, bytes]:
+    """Topic and message of an item: what `item_of` reads."""
+    match item:
+        case Scan():
+            return POINTS_TOPIC, cloud_of(item).SerializeToString()
+        case MotionSample():
+            return MOTION_TOPIC, motion_message_of(item).SerializeToString()
+        case GnssFix():
+            return GNSS_TOPIC, fix_of(item).SerializeToString()
+        case ReferencePose():
+            return REFERENCE_TOPIC, pose_message_of(item).SerializeToString()
+        case Detections():
+            return DETECTIONS_TOPIC, detections_message_of(item).SerializeToString()
+        case LaneLook():
+            return LANES_TOPIC, lane_message_of(item).SerializeToString()
 
 
 def _check_channels(summary: Summary) -> None:

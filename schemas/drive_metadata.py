@@ -1,7 +1,7 @@
 """The header of a drive as the metadata record of its MCAP file.
 
-What older programs did not write (`deskew`, `sweep_ns`, `mount`, `mount_sigma`) is only written where it says
-something, and may be missing: such files keep their bytes.
+What older programs did not write (`deskew`, `sweep_ns`, `mount`, `mount_sigma`, `nowhere`, `stand_ins`)
+is only written where it says something, and may be missing: such files keep their bytes.
 """
 
 import zlib
@@ -47,6 +47,8 @@ def _newer_fields(header: DriveHeader) -> dict[str, str]:
         "sweep_ns": str(header.sweep_ns) if header.sweep_ns else "",
         "mount": "" if header.mount == "unsaid" else header.mount,
         "mount_sigma": " ".join(repr(float(one)) for one in sigma) if sigma else "",
+        "nowhere": "yes" if header.nowhere else "",
+        "stand_ins": " ".join(header.stand_ins),
     }
     return {key: value for key, value in fields.items() if value}
 
@@ -58,7 +60,8 @@ def _newer_values(metadata: Mapping[str, str]) -> dict[str, Any]:
         sigma = MountSigma(*map(float, metadata["mount_sigma"].split())) if "mount_sigma" in metadata else None
     except (ValueError, TypeError) as error:
         raise DriveError(f"metadata {METADATA!r}: sweep time or sigma of the mount is no number: {error}") from error
-    told = {key: metadata[key] for key in ("deskew", "mount") if key in metadata}
+    told: dict[str, Any] = {key: metadata[key] for key in ("deskew", "mount") if key in metadata}
+    told |= {"nowhere": "nowhere" in metadata, "stand_ins": tuple(metadata.get("stand_ins", "").split())}
     return {**told, "sweep_ns": sweep_ns, "mount_sigma": sigma}
 
 

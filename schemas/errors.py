@@ -7,7 +7,9 @@ SchemaError
 ├── Malformed       bytes that are not the message they should be
 ├── BadValue        a field whose value cannot be
 ├── WrongHash       content that does not have the hash it claims
+├── LayerError      a declaration of a feature layer that cannot be, or is missing
 ├── DriveError      a recorded drive that cannot be read or written
+├── NoPlace         a drive whose place on the Earth is not known, where one is needed
 └── TrajectoryError a file of poses that cannot be read or written
 """
 
@@ -42,8 +44,16 @@ class WrongHash(SchemaError):
     """Content that does not have the hash it claims."""
 
 
+class LayerError(SchemaError):
+    """A declaration of a feature layer that cannot be, or is missing."""
+
+
 class DriveError(SchemaError):
     """A recorded drive that cannot be read or written."""
+
+
+class NoPlace(SchemaError):
+    """A drive whose place on the Earth is not known, where one is needed."""
 
 
 class TrajectoryError(SchemaError):

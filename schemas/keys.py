@@ -84,6 +84,13 @@ KEY_TABLE: Final = (
         reliability="totals: the next one makes up for a lost one",
     ),
     KeySpec(
+        pattern=f"{ROOT}/live/<vehicle>/<topic>",
+        kind="put, a vehicle's own sensors → its agent; query on <topic> = header",
+        request="the message of a drive's topic (`/lidar/points`: lidar-points); –",
+        reply="LiveHeader (JSON)",
+        reliability="the newest counts; what is left out is counted",
+    ),
+    KeySpec(
         pattern=f"{ROOT}/alive/<role>/<id>",
         kind="liveliness token",
         request="–",
@@ -168,6 +175,12 @@ def traffic_key(vehicle: str) -> str:
 def traffic_keys() -> str:
     """The traffic samples of every vehicle."""
     return f"{ROOT}/traffic/*"
+
+
+def live_key(vehicle: str, topic: str) -> str:
+    """Where a vehicle's own sensors put the messages of a drive's topic, or "header", or "*"."""
+    name = topic if topic == "*" else _matching("topic", topic.strip("/").replace("/", "-"), VEHICLE_PATTERN)
+    return f"{ROOT}/live/{_matching('vehicle', vehicle, VEHICLE_PATTERN)}/{name}"
 
 
 def alive_key(role: str, member: str) -> str:

@@ -103,6 +103,10 @@ class TileUpdate:
         """Whether it says what has changed; else that is to be asked for."""
         return self.delta is not None or bool(self.coded_delta)
 
+    def follows(self, sha: bytes) -> bool:
+        """Whether it says what has changed since the version of that hash."""
+        return self.has_delta and self.previous_sha == sha
+
     @property
     def voxels(self) -> tuple[int, int] | None:
         """(put, removed) by this version; None where the notice does not tell."""

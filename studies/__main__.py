@@ -1,6 +1,6 @@
 """`python -m studies [NAME …] [--json]`: run the benchmarks and print their figures with their commands.
 
-A benchmark with options of its own takes them when it is named alone: `python -m studies codec --help`.
+A benchmark with options of its own takes them when it is named alone: `python -m studies poles --help`.
 """
 
 import importlib
@@ -12,11 +12,7 @@ import click
 from studies.frame.measure import machine, print_figures
 from studies.frame.options import click_options, options_of
 
-NAMES: Final = (
-    "detection", "segmentation", "localisation", "scan-to-scan", "clock", "first-pose", "health", "ingest",
-    "short-reports", "sizes", "codec", "return-download", "gnss-noise", "poles", "features-merge", "merging",
-    "slamcu-step", "camera-pipeline", "map-build", "stalled", "outage",
-)  # fmt: skip
+NAMES: Final = ("ingest", "poles", "stalled", "outage")
 
 
 def main() -> None:

@@ -13,9 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.ensemble import HistGradientBoostingClassifier
-from sklearn.linear_model import LogisticRegression
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 from gnd.fleet_sim.drives import DriveConfig, DriveSimulation
 from gnd.fleet_sim.evaluate import voxel_rows
@@ -25,7 +22,6 @@ from gnd.fleet_sim.world import World
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.grid import GridFrame
-from gnd.vehicle_agent.detect.classify import DETECT_RESHAPED_LOG_ODDS
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.detect.parameters import MIN_CELLS
@@ -117,35 +113,8 @@ def forest_of(model: HistGradientBoostingClassifier) -> Forest:
     return Forest(baseline, sizes[:-1].astype(np.int32), threshold=joint["threshold"].astype(np.float64), **ints)
 
 
-def f1(said: NDArray[np.bool_], true: NDArray[np.bool_]) -> float:
-    """Return the F1 of "modified", in percent."""
-    return 200.0 * float((said & true).sum()) / max(int(said.sum() + true.sum()), 1)
-
-
-def judged(train: Examples, test: Examples) -> dict[str, float]:
-    """Return the F1 of "modified" among scored voxels by each rule, fitted on other worlds than it is judged on."""
-    limit = DETECT_RESHAPED_LOG_ODDS
-    odds = {
-        "similarity below 0.5": 0.5 - test.features[:, 2] + limit,
-        "similarity alone": _linear(train, test, [2]) + limit,
-        "offset along the new thin axis alone": _linear(train, test, [1]) + limit,
-        "similarity, outside share, thickness (linear)": _linear(train, test, [2, 3, 6]) + limit,
-        "all features (linear)": _linear(train, test, list(range(len(MONOTONE)))) + limit,
-        "all features (monotone trees)": forest_of(fit(train)).log_odds(test.features),
-    }
-    return {name: f1(value[test.scored] > limit, test.modified[test.scored]) for name, value in odds.items()}
-
-
-def _linear(train: Examples, test: Examples, columns: list[int]) -> F64:
-    """Return the log-odds (N,) of a logistic regression on some of the features."""
-    model = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
-    weight = np.where(train.scored, SCORED_WEIGHT, 1.0)
-    model.fit(train.features[:, columns], train.modified, logisticregression__sample_weight=weight)
-    return np.asarray(model.decision_function(test.features[:, columns]))
-
-
 def main() -> None:
-    """Fit on all seeds but one, judge on that one; then fit on all and write the file."""
+    """Fit on all seeds and write the file."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", default=",".join(map(str, SEEDS)), help="tuning worlds")
     parser.add_argument("--vehicles", type=int, default=12)
@@ -154,11 +123,6 @@ def main() -> None:
     seeds = [int(text) for text in options.seeds.split(",")]
     with ProcessPoolExecutor(2) as pool:
         found = list(pool.map(examples_of_world, seeds, [options.vehicles] * len(seeds)))
-    scores = [judged(joined([e for e in found if e is not one] or found), one) for one in found]
-    print(f"F1 of modified among {sum(int(e.scored.sum()) for e in found)} scored examples of worlds {options.seeds},")
-    print("each judged by what was fitted on the others:")
-    for name in scores[0]:
-        print(f"  {name:48} {np.mean([score[name] for score in scores]):5.1f}")
     options.out.write_text(forest_of(fit(joined(found))).to_json(), encoding="utf-8")
     print(f"{options.out.name}: {TREES} trees")
 

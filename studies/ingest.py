@@ -111,9 +111,9 @@ def _costs(reports: Corpus) -> list[Figure]:
     warm_up()
     with tempfile.TemporaryDirectory() as folder, SqliteStore(Path(folder) / "store.sqlite") as store:
         store.put_tiles(reports.tiles())
-        told: list[ReportState] = []
+        states: list[ReportState] = []
         ingest = Ingest(store, "bench")
-        expander = Expander(store, ShardConfig("bench"), lambda _, state: told.append(state))
+        expander = Expander(store, ShardConfig("bench"), lambda _, state: states.append(state))
         many = from_many(reports.reports, CHEAP_REPORTS, "cheap")
         letters = [(one.key, one.packed.encode()) for one in many]
         to_ack = 1e3 * spent_s(lambda: _in_threads(lambda letter: ingest.answer(*letter), letters)) / len(letters)
@@ -130,17 +130,19 @@ def _second_halves(reports: Corpus) -> float:
     """CPU a second half, ms, of reports of which any Gaussians are wanted."""
     with tempfile.TemporaryDirectory() as folder, SqliteStore(Path(folder) / "store.sqlite") as store:
         store.put_tiles(reports.tiles())
-        told: dict[str, bytes] = {}
+        states: dict[str, bytes] = {}
         ingest = Ingest(store, "bench")
-        expander = Expander(store, ShardConfig("bench"), lambda _, state: told.update({state.report_id: state.wanted}))
+        expander = Expander(
+            store, ShardConfig("bench"), lambda _, state: states.update({state.report_id: state.wanted})
+        )
         many = from_many(reports.reports, LOOKED_AT, "halves")
         for one in many:
             ingest.answer(one.key, one.packed.encode())
         while expander.work():
             pass
-        asked = [one for one in many if told[one.packed.report_id]]
+        asked = [one for one in many if states[one.packed.report_id]]
         for one in asked:
-            half = pack_measured(one.whole, reports.bases(), told[one.packed.report_id])
+            half = pack_measured(one.whole, reports.bases(), states[one.packed.report_id])
             ingest.answer(one.key, half.encode())
         return 1e3 * spent_s(lambda: _work(expander, len(asked))) / max(len(asked), 1)
 

@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from gnd.fleet_sim.street import street
-from gnd.fleet_sim.world import World
+from gnd.fleet_sim.drives import PERFECT, DriveConfig
 from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.grid import GridFrame
@@ -18,21 +16,9 @@ from gnd.gnd_map.tile_id import covering_corridor
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import load_track, read_drive, read_header
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate
-from gnd.vehicle_agent.pipeline import Output, Pipeline
-from gnd.vehicle_agent.sources.recording import first_fix
-from gnd.vehicle_agent.tiles_at_hand import AllTilesHeld, localising_on
 
-Localising = Pipeline[AllTilesHeld]
-SEED = 1
 MAP_REACH_M = 70.0
 MAPPING = DriveConfig("map", "HDL-32E", "before", errors=PERFECT, car_share=0.0, cruise_mps=12.0)
-
-
-def mapped_street(folder: Path) -> tuple[World, F64, LocalMap]:
-    """The street, all points (N, 3) of a mapping drive through its state before, map frame, and their Gaussians."""
-    world = street(SEED)
-    return world, *map_of(simulate_drive(world, MAPPING, folder / "mapping.mcap"))
 
 
 def map_of(path: Path) -> tuple[F64, LocalMap]:
@@ -62,16 +48,3 @@ def true_scans(path: Path) -> Iterator[tuple[F64, F64]]:
         if isinstance(scan, Scan):
             points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, reference, T_vehicle_lidar, scan.t_ns)
             yield points, reference.at(scan.t_ns)
-
-
-def localising(path: Path, local_map: LocalMap, parameters: LocaliserParameters | None = None) -> Localising:
-    """A vehicle that localises along a recorded drive."""
-    fix, _ = first_fix(read_drive(path), path)
-    return localising_on(local_map, read_header(path), fix, parameters)
-
-
-def note_newest(output: Output, estimates: list[PoseEstimate]) -> None:
-    """Append the online pose when it is a new one that is not lost."""
-    online = output.online
-    if online is not None and online.health != "lost" and (not estimates or online.t_ns > estimates[-1].t_ns):
-        estimates.append(online)

@@ -4,8 +4,8 @@ The passes are cut from the run's own reports with their errors, of one tile eac
 them were made against the stale base map:
 
 - `other`: what the vehicle saw of the voxels that it did not find changed;
-- `half`: the western half of what it saw and said;
-- `fifth`: a fifth of what it saw and said, at random.
+- `half`: the western half of what it observed and reported;
+- `fifth`: a fifth of what it observed and reported, at random.
 
 They come from vehicles of their own, seconds to minutes apart by the clock of the cloud, through the real store and the
 real worker. Printed: F1 before and after, versions published, and the CPU time of a report by its number.
@@ -140,13 +140,13 @@ def _part(change: TileChange, kind: str, numbers: np.random.Generator) -> TileCh
     else:
         keep = numbers.random(len(seen)) < 0.2
     ids = np.ascontiguousarray(seen[keep])
-    said = np.isin(change.changed.voxel_id, ids)
+    stated = np.isin(change.changed.voxel_id, ids)
     return replace(
         change,
         observed=ids,
-        changed=change.changed.take(said),
-        change_class=change.change_class[said],
-        evidence=change.evidence[said],
+        changed=change.changed.take(stated),
+        change_class=change.change_class[stated],
+        evidence=change.evidence[stated],
         doubt=None,
     )
 
@@ -210,12 +210,12 @@ def drives(run: Path, n: int, folder: Path, base_path: Path) -> dict[str, Any]:
             cloud.now_ns += 20 * _NS_PER_S
             cloud.hear(report)
         healing.append(cloud.notices())
-    healed, told = truth and _f1(truth, base, cloud.tiles()), []
+    healed, repeated = truth and _f1(truth, base, cloud.tiles()), []
     for k in range(n):
         cloud.now_ns += 600 * _NS_PER_S
         for report in _as_another(own[k % len(own)], f"again-{k}", cloud.now_ns):
             cloud.hear(report)
-        told.append(cloud.notices())
+        repeated.append(cloud.notices())
     after = truth and _f1(truth, base, cloud.tiles())
     cloud.store.close()
     some = min(len(own), n // 2)
@@ -224,10 +224,10 @@ def drives(run: Path, n: int, folder: Path, base_path: Path) -> dict[str, Any]:
         "drives": len(own),
         "bytes of notices, healing": healing,
         "f1_healed": healed,
-        "bytes of notices, again": told,
+        "bytes of notices, again": repeated,
         "f1_after": after,
-        f"last {some} / first {some} again": round(sum(told[-some:]) / max(sum(told[:some]), 1), 4),
-        f"last {some} again / first {some} of all": round(sum(told[-some:]) / max(sum(healing[:some]), 1), 4),
+        f"last {some} / first {some} again": round(sum(repeated[-some:]) / max(sum(repeated[:some]), 1), 4),
+        f"last {some} again / first {some} of all": round(sum(repeated[-some:]) / max(sum(healing[:some]), 1), 4),
     }
 
 

@@ -20,8 +20,7 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusClosed, RequestFailed
 from gnd.schemas.keys import change_key, tile_key, update_keys
 from studies.frame.measure import Figure
-from studies.sizes import change_report
-from studies.small_cloud import READY_S, SmallCloud, small_cloud
+from studies.small_cloud import READY_S, SmallCloud, change_report, small_cloud
 
 VICTIMS = {"router": ("tile", "report", "update"), "store": ("tile",), "merger-0": ("report", "update")}
 KILLS = 3

@@ -1,7 +1,7 @@
 """How well poles are found: simulated streets against their truth, and real scans against the scans after them.
 
 A post counts as observable when at least 6 returns lie on it that span at least 1.5 m upwards; lamps, signs and trees
-are the posts that stand alone, posts of scaffolds are told apart, bollards are too low. A detection is right where a
+are the posts that stand alone, posts of scaffolds are counted apart, bollards are too low. A detection is right where a
 post of any kind, a scaffold's or a bollard too, stands within 0.5 m. Single scans, and windows of five scans over two
 seconds whose places are wrong by 4 cm and 0.08° (one standard deviation, drawn for each scan). Traffic and people are
 on the street. Worlds and drives were not used for tuning. Recordings have no labels: the share of the poles within 30 m
@@ -109,20 +109,20 @@ def _misplaced(scan: PoleScan, rng: np.random.Generator) -> Rays:
 def _by_range(name: str, score: PoleScore) -> Iterator[Figure]:
     for band, (low, high) in enumerate(BANDS):
         recall, n = score.recall(band)
-        precision, told = score.precision(band)
+        precision, detections = score.precision(band)
         parts = ", ".join("{} {:.0f} % of {}".format(s, *score.recall(band, [s])) for s in (*SINGLE, "scaffold"))
         yield Figure(f"found, {name}, {low} to {high} m", recall, "%", f"of {n} observable; {parts}")
-        yield Figure(f"right, {name}, {low} to {high} m", precision, "%", f"of {told} detections")
+        yield Figure(f"right, {name}, {low} to {high} m", precision, "%", f"of {detections} detections")
 
 
 def _figures(name: str, score: PoleScore) -> Iterator[Figure]:
     recall, n = score.recall()
     of_all, everything = score.recall_of_all()
-    precision, told = score.precision()
+    precision, detections = score.precision()
     error_m, nees = np.array(score.errors_m), np.array(score.nees)
     spread = float(np.std(score.diameters_m))
     yield Figure(f"found, {name}", recall, "%", f"of {n} observable; {of_all:.0f} % of all {everything} within 40 m")
-    yield Figure(f"right, {name}", precision, "%", f"of {told} detections")
+    yield Figure(f"right, {name}", precision, "%", f"of {detections} detections")
     yield Figure(f"off, {name}, median", 100 * float(np.median(error_m)), "cm",
                  f"95 %: {100 * np.quantile(error_m, 0.95):.1f} cm")  # fmt: skip
     yield Figure(

@@ -28,8 +28,7 @@ from gnd.fleet_bus.router import wait_for_stop
 from gnd.schemas.keys import change_key, tile_key, tiles_key, update_keys
 from gnd.schemas.updates import TileUpdate
 from studies.frame.measure import Figure
-from studies.sizes import change_report
-from studies.small_cloud import READY_S, SmallCloud, small_cloud
+from studies.small_cloud import READY_S, SmallCloud, change_report, small_cloud
 from studies.small_cloud import tiles as map_tiles
 
 PUBLISH_EVERY_S = 0.1

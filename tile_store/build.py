@@ -207,6 +207,7 @@ def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[M
 
 def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> MapSource:
     header, track = read_header(path), load_track(path)
+    header.check_placed()
     check_poses(path, track.reference)
     _check_gnss(path, header.anchor, track.reference, track.gnss, parameters)
     T_map_vehicle = anchor.T_self_other(header.anchor) @ track.reference.T_map_vehicle

@@ -21,6 +21,7 @@ from gnd.fleet_bus.router import wait_for_stop
 from gnd.fleet_bus.settings_file import load_settings
 from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import check_settings, setting, settings_text
+from gnd.schemas.feature_layer import LayerParameters, checked_layers
 from gnd.tile_store import tables, upkeep_cli
 from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from gnd.tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
@@ -44,8 +45,15 @@ class TileServerConfig:
     connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers, tried in order.")
     workers: int = setting(4, "Threads that answer.", least=1, most=64)
 
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (),
+        "Feature layers, as agents and shards read them: checked here, so that one file serves all. The server answers"
+        " for every layer that its store holds.",
+    )
+
     def __post_init__(self) -> None:
         check_settings(self, StoreError)
+        checked_layers(self.feature_layer)
 
 
 @click.command()

@@ -27,7 +27,7 @@ class StoreDamaged(StoreUnavailable):
 
 
 class StoreBusy(StoreError):
-    """Another process has held the write lock for longer than `busy_timeout_s`."""
+    """Another process has held the write lock for longer than `BUSY_TIMEOUT_S`."""
 
 
 class StoreClosed(StoreError):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 from urllib.parse import quote
 
 import apsw
@@ -139,13 +139,19 @@ def _opened_reader(name: str, path: Path, flags: int) -> apsw.Connection:
 def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> None:
     connection.set_busy_handler(_Patience(busy_timeout_s))
     found = _retry_busy(lambda: schema_of(connection, path), busy_timeout_s)
-    _retry_busy(lambda: connection.pragma("journal_mode", "wal"), busy_timeout_s)
-    connection.pragma("synchronous", "full")
+    log_ahead(connection, "full", busy_timeout_s)
     connection.pragma("trusted_schema", False)
     if connection.readonly("main"):
         raise StoreUnavailable(f"{path}: read-only; a store must be writable")
     if found < SCHEMA_VERSION:
         migrate(connection, path)
+
+
+def log_ahead(connection: apsw.Connection, synchronous: Literal["full", "normal"], busy_timeout_s: float) -> None:
+    """Have a connection write through a log (WAL), wait for other writers, and sync each commit ("full") or not."""
+    connection.set_busy_handler(_Patience(busy_timeout_s))
+    _retry_busy(lambda: connection.pragma("journal_mode", "wal"), busy_timeout_s)
+    connection.pragma("synchronous", synchronous)
 
 
 class _Patience:

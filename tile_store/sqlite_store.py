@@ -64,6 +64,10 @@ from gnd.tile_store.writer import GroupWriter, NoWriter
 
 _T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000
+BUSY_TIMEOUT_S: Final = 30.0
+"""A writer waits this long for the writers of other processes."""
+GROUP_MAX: Final = 256
+"""At most so many calls share one commit."""
 REPORTS_A_PAGE: Final = 256
 LAGS_LOOKED_AT: Final = 256
 SHARD_FORGOTTEN_NS: Final = 86_400 * NS_PER_S
@@ -107,8 +111,8 @@ class SqliteStore:
             require_current(self.path)
             self._writer = NoWriter(self.path)
         else:
-            connection = open_writer(self.path, create=create, busy_timeout_s=self._config.busy_timeout_s)
-            self._writer = GroupWriter(connection, group_max=self._config.group_max)
+            connection = open_writer(self.path, create=create, busy_timeout_s=BUSY_TIMEOUT_S)
+            self._writer = GroupWriter(connection, group_max=GROUP_MAX)
             self._enter_boot()
 
     def __enter__(self) -> "SqliteStore":

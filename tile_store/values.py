@@ -106,13 +106,6 @@ class StoreConfig:
         "... or any when it holds so many: what one merge has to read stays bounded.",
         least=1,
     )
-    busy_timeout_s: float = setting(
-        30.0,
-        "A writer waits this long for the writers of other processes.",
-        unit="s",
-        above=0,
-    )
-    group_max: int = setting(256, "At most so many calls share one commit.", least=1)
     quarantine_mb: float = setting(
         64.0,
         "Of the newest refused messages so much is kept: nobody can fill the disk with nonsense.",

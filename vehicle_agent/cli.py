@@ -15,13 +15,21 @@ from gnd.gnd_map.settings import settings_text
 
 @click.command()
 @click.option("--drive", type=click.Path(path_type=Path), help="Recording (MCAP) to drive.")
+@click.option(
+    "--live",
+    type=click.Choice(["ros2", "zenoh"]),
+    help="Drive now: on topics of ROS 2 over rmw_zenoh, or on plain keys; --set live.connect=[…] names their router.",
+)
 @click.option("--vehicle", help="Pseudonym of the vehicle.  [default: vehicle]")
 @click.option("--connect", multiple=True, help=f"Router; repeatable.  [default: {DEFAULT_ENDPOINT}]")
 @click.option("--link", help="Mobile link to feel: 3g, 4g, 5g, none or a TOML file.  [default: none]")
 @click.option("--work-dir", type=click.Path(path_type=Path), help="Cache, outbox and result.  [default: runs/VEHICLE]")
 @click.option("--pace", type=float, help="1 = real time, 0 = as fast as possible.  [default: 0]")
 @click.option("--mode", type=click.Choice(["default", "paper"]), help="Rules of change detection.")
-@click.option("--layers", help="Layers to keep up to date: ndt,signs,streetlights,poles.  [default: ndt]")
+@click.option(
+    "--layers",
+    help="Such as ndt,signs,streetlights,poles, or declared ones.  [default: ndt]",
+)
 @click.option(
     "--localise-by",
     type=click.Choice(["lidar", "slamcu", "graph"]),
@@ -31,6 +39,7 @@ from gnd.gnd_map.settings import settings_text
 @click.option("--verbose", "-v", is_flag=True, help="Log every report and retry.")
 def agent(
     drive: Path | None,
+    live: str | None,
     work_dir: Path | None,
     connect: tuple[str, ...],
     mode: str | None,
@@ -41,7 +50,7 @@ def agent(
     verbose: bool,
     **plain: Any,
 ) -> None:
-    """Drive a recording: download tiles, localise, detect changes, upload them until acknowledged.
+    """Drive a recording, or now (--live): download tiles, localise, detect changes, upload them until acknowledged.
 
     All settings: docs/configuration.md. They come from --config FILE, the environment (GND_AGENT__PACE=1) and --set
     (report.longest_s=30), in this order; options go before all.
@@ -52,6 +61,7 @@ def agent(
     logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(asctime)s %(name)s %(message)s")
     options = plain | {
         "drive": None if drive is None else str(drive),
+        "live": {"source": live},
         "work_dir": None if work_dir is None else str(work_dir),
         "connect": list(connect) or None,
         "detect": {"mode": mode},
@@ -62,8 +72,13 @@ def agent(
         click.echo(settings_text(config), nl=False)
         return
     stop = threading.Event()
+
+    def end(number: int, _frame: object) -> None:
+        stop.set()
+        signal.signal(number, signal.SIG_DFL)  # a second one ends at once: reports wait in the outbox
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, end)
     click.echo(summary_line(run_agent(config, stop)))
 
 

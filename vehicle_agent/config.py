@@ -8,6 +8,7 @@ from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.fleet_bus.links import LinkProfile
 from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.settings import check_settings, setting
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
@@ -36,7 +37,6 @@ class DownloadParameters:
     ahead_m: float = setting(
         120.0, "How far along the heading tiles are asked for in advance, at least.", unit="m", least=0
     )
-    ahead_s: float = setting(15.0, "The same in time: a faster vehicle looks farther.", unit="s", least=LEAD_S)
     in_flight: int = setting(8, "Requests at a time; one at a time leaves a 5G link at 15 %.", least=1, most=64)
     request_s: float = setting(20.0, "Time for one request, its retries included.", unit="s", above=0)
     retry_s: float = setting(1.0, "Pause after a request that failed.", unit="s", least=0)
@@ -127,6 +127,32 @@ class ReportParameters:
 
 
 @dataclass(frozen=True, slots=True)
+class LiveParameters:
+    """Where a vehicle that drives now gets its measurements (`--live`)."""
+
+    source: Literal["", "ros2", "zenoh"] = setting(
+        "", "Topics of ROS 2 over rmw_zenoh, or the plain keys of `gnd play --zenoh`; empty: a recording is driven."
+    )
+    connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of the router of the vehicle's own sensors.")
+    domain: int = setting(0, "ROS_DOMAIN_ID.", least=0, most=232)
+    points: str = setting("", "Topic of the LiDAR's sweeps; the only one of its type where it is not named.")
+    gnss: str = setting("", "Topic of positions; likewise.")
+    speed: str = setting("", "Topic whose twist gives speed and yaw rate: Odometry or TwistStamped; likewise.")
+    imu: str = setting("", "Topic of a gyro that gives the yaw rate instead; empty: none.")
+    vehicle_frame: str = setting("", "Frame of the vehicle, x forward; empty: base_footprint, base_link, ...")
+    mount: tuple[float, ...] = setting(
+        (), "x, y, z (m), roll, pitch, yaw (deg) of the LiDAR in the vehicle; empty: /tf_static tells."
+    )
+    silent_s: float = setting(0.0, "The drive ends once nothing has come for so long; 0: never.", unit="s", least=0)
+
+    def __post_init__(self) -> None:
+        """Numbers that can be."""
+        check_settings(self, AgentConfigError)
+        if len(self.mount) not in (0, 6):
+            raise AgentConfigError(f"live.mount = {list(self.mount)}: x, y, z, roll, pitch, yaw are needed")
+
+
+@dataclass(frozen=True, slots=True)
 class PipelineParameters:
     """What a vehicle's algorithms go by."""
 
@@ -146,7 +172,7 @@ class AgentConfig:
     """
 
     vehicle: str = setting(..., "Pseudonym of the vehicle.")
-    drive: Path = setting(..., "Recording (MCAP) to drive.")
+    drive: Path | None = setting(..., "Recording (MCAP) to drive; none where the vehicle drives now.")
     work_dir: Path = setting(..., "Folder of cache, outbox and result.")
     connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers, tried in order.")
     link: str | LinkProfile = setting("none", "Mobile link to feel: 3g, 4g, 5g, none or a TOML file.")
@@ -162,12 +188,18 @@ class AgentConfig:
     )
     departure: Departure | None = None
     ledger_dir: Path | None = setting(None, "Folder of the traffic ledger; by default `ledger` beside `work_dir`.")
+    live: LiveParameters = setting(LiveParameters, "Topics of a vehicle that drives now.")
     localise: LocaliserParameters = setting(LocaliserParameters, "Localisation.")
     segment: SegmentParameters = setting(SegmentParameters, "Segmentation of what moves.")
     detect: DetectParameters = setting(DetectParameters, "Detection of changes.")
     download: DownloadParameters = setting(DownloadParameters, "Download of tiles.")
     report: ReportParameters = setting(ReportParameters, "Reports.")
     features: FeatureParameters = setting(FeatureParameters, "Feature layers.")
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (),
+        "Feature layers that the user declares, beside signs, streetlights and poles; agents, shards and the tile"
+        " server read the same tables.",
+    )
     localise_by: LocaliseBy = setting(
         "lidar",
         "Scans on the voxel map; or, without LiDAR, a particle filter of motion, GNSS and the features of one layer"
@@ -177,6 +209,8 @@ class AgentConfig:
     def __post_init__(self) -> None:
         """A name and a pace that can work."""
         check_settings(self, AgentConfigError)
+        if (self.drive is None) == (not self.live.source):
+            raise AgentConfigError("one of the two is needed: a recording (--drive FILE), or --live ros2|zenoh")
         if not self.vehicle:
             raise AgentConfigError("the vehicle needs a name (its pseudonym)")
         if is_feature_layer(self.layer):
@@ -199,4 +233,4 @@ class AgentConfig:
     @property
     def waits_for_tiles(self) -> bool:
         """A drive that is not paced would otherwise outrun any link."""
-        return self.pace == 0
+        return self.pace == 0 and not self.live.source

@@ -2,8 +2,12 @@
 
 The track is found over *all* scans before any is left out, so that the halves of a recording share one frame: what one
 half maps, the other half can drive on.
+
+Nothing is invented: a recording that does not say where on the Earth it was taken becomes no drive, unless the drive is
+marked so; fixes and motion that were not measured are written only on request, and the drive says which.
 """
 
+import re
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -14,23 +18,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.motion import Trajectory
-from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
-from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, StandIn
 from gnd.schemas.drive_mcap import DriveWriter
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.apollo import open_apollo
+from gnd.vehicle_agent.importers.argoverse_logs import open_argoverse
+from gnd.vehicle_agent.importers.bins import open_bins
+from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
 from gnd.vehicle_agent.importers.deskewing import with_times
 from gnd.vehicle_agent.importers.detect_format import format_of
+from gnd.vehicle_agent.importers.fitting import fit_heading_and_position as fit_heading_and_position
 from gnd.vehicle_agent.importers.kitti import open_kitti
+from gnd.vehicle_agent.importers.kitti_raw import open_kitti_raw
+from gnd.vehicle_agent.importers.las import open_las
 from gnd.vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
-from gnd.vehicle_agent.importers.mcap_clouds import open_mcap_clouds
+from gnd.vehicle_agent.importers.mcap_clouds import is_foxglove_or_own, open_mcap_clouds
 from gnd.vehicle_agent.importers.mounting import levelled, with_mount
+from gnd.vehicle_agent.importers.nuscenes import open_nuscenes
+from gnd.vehicle_agent.importers.output import check_output
+from gnd.vehicle_agent.importers.overrides import BadScans, as_chosen, passing_over
+from gnd.vehicle_agent.importers.pcap import open_pcap
 from gnd.vehicle_agent.importers.pcd import open_pcd
 from gnd.vehicle_agent.importers.planes import open_planes
+from gnd.vehicle_agent.importers.quality import Quality, fixes_within, quality_of
 from gnd.vehicle_agent.importers.radiate import open_radiate
-from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Entry, Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.ros.reader import open_ros
 from gnd.vehicle_agent.importers.splits import chosen_scans
+from gnd.vehicle_agent.importers.suspicions import check_track, suspicious_scans
 
 F64 = NDArray[np.float64]
 
@@ -41,9 +58,28 @@ FORMATS: Final[dict[str, Callable[[Path, RecordingAnchor | None], Recording]]] =
     "mcap": open_mcap_clouds,
     "planes": open_planes,
     "apollo": open_apollo,
+    "ros": open_ros,
+    "bin": open_bins,
+    "kitti-raw": open_kitti_raw,
+    "nuscenes": open_nuscenes,
+    "argoverse": open_argoverse,
+    "las": open_las,
+    "pcap": open_pcap,
 }
+CHOOSING: Final[dict[str, Callable[[Path, RecordingAnchor | None, Choices | None], Recording]]] = {
+    "ros": open_ros,
+    "pcd": open_pcd,
+    "nuscenes": open_nuscenes,
+    "argoverse": open_argoverse,
+    "las": open_las,
+    "pcap": open_pcap,
+}
+"""Formats whose readers heed choices themselves: topics, fields."""
 AUTO: Final = "auto"
 AROUND_NS = 300_000_000  # motion and fixes kept before the first and after the last chosen scan
+DEFAULTS: Final = Choices()
+LEAST_SURE_HEADING_DEG: Final = 5.0
+"""A heading that the fixes tell less surely is a warning: 9 m beside the track after 100 m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +87,8 @@ class Imported:
     """What became of a recording.
 
     scans: written. empty_scans: left out, because no point of them was left. points_not_finite, points_too_far: left
-    out of scans that were written or empty. notes: what else had to be put right.
+    out of scans that were written or empty. notes: what else had to be put right. bad: files that could not be read
+    and were passed over, with the reason. quality: what a mapper wants to know.
     """
 
     scans: int
@@ -59,6 +96,8 @@ class Imported:
     points_not_finite: int
     points_too_far: int
     notes: tuple[str, ...] = ()
+    bad: tuple[str, ...] = ()
+    quality: Quality | None = None
 
     @property
     def skipped(self) -> tuple[str, ...]:
@@ -68,7 +107,8 @@ class Imported:
             (self.points_not_finite, "points that are no numbers: left out"),
             (self.points_too_far, f"points beyond {MAX_RANGE_M:.0f} m: left out"),
         )
-        return (*self.notes, *(f"{n} {what}" for n, what in counts if n))
+        passed = (f"passed over: {reason}" for reason in self.bad)
+        return (*self.notes, *passed, *(f"{n} {what}" for n, what in counts if n))
 
 
 def no_progress(_step: str, _done: int, _total: int) -> None:
@@ -84,40 +124,91 @@ def import_recording(
     anchor: RecordingAnchor | None = None,
     vehicle: str = "recorded",
     topic: str | None = None,
+    choices: Choices = DEFAULTS,
     progress: Progress = no_progress,
 ) -> Imported:
-    """Write the drive `out` (MCAP) from a recording; tell what was written and what was left out.
+    """Write the drive `out` (MCAP) from a recording; return what was written and what was left out.
 
     Args:
-        kind: "kitti", "radiate", "pcd", "mcap", "planes", "apollo", or "auto" to find out.
+        kind: one of `FORMATS`, or "auto" to find out.
         folder: of the recording (or its file); see the readers for what it must hold.
         out: file to write.
         scans: which scans; see `chosen_scans`.
         anchor: place on the Earth; see the readers for what it means and whether it may be left out.
         vehicle: pseudonym written into the drive.
-        topic: of the clouds in an MCAP file that has several.
+        topic: of the clouds in a bag that has several.
+        choices: all other decisions; `anchor` and `topic` come before what it says of them.
         progress: called with a step's name, how much is done, and of how much.
 
     Raises:
-        ImportDriveError: the folder is missing, holds no scans of that format, or is damaged.
+        ImportDriveError: the folder is missing, holds no scans of that format, is damaged, or does not say where on
+            the Earth it was recorded; or `out` is one of the files that are read.
         DriveError: the drive cannot be written.
     """
-    recording = open_recording(kind, folder, anchor, topic)
-    chosen_scans(scans, len(recording))  # a wrong rule is told before the long work
+    choices = replace(choices, anchor=anchor or choices.anchor, topic=topic or choices.topic)
+    check_output(out, folder, *([Path(choices.poses)] if choices.poses else []))
+    recording = open_recording(kind, folder, choices.anchor, choices.topic, choices)
+    return import_opened(recording, out, scans=scans, vehicle=vehicle, choices=choices, progress=progress)
+
+
+def import_opened(
+    recording: Recording,
+    out: Path,
+    *,
+    scans: str = "all",
+    vehicle: str = "recorded",
+    choices: Choices = DEFAULTS,
+    progress: Progress = no_progress,
+) -> Imported:
+    """The same with a recording that is open already; whoever calls has looked that `out` is none of its files."""
+    chosen_scans(scans, len(recording))  # a wrong rule is named before the long work
+    if not (recording.placed or choices.nowhere):
+        raise ImportDriveError(
+            f"{recording.name}: nothing says where on the Earth it was recorded: give --anchor LAT,LON,HEIGHT, or"
+            " --poses with geodetic, UTM or ECEF coordinates or a GNSS track; --nowhere makes a drive that no shared"
+            " map takes"
+        )
+    bad = BadScans()
+    if not choices.strict:
+        recording = passing_over(recording, bad)
+    recording = replace(recording, notes=(*recording.notes, *suspicious_scans(recording)))
     recording, track = prepared(recording, progress)
-    return write_drive(recording, track, out, scans, vehicle, progress)
+    recording = replace(recording, notes=(*recording.notes, *check_track(recording, track)))
+    imported = write_drive(recording, track, out, scans, vehicle, progress, stand_ins=choices.stand_ins)
+    return replace(imported, bad=bad.reasons, quality=quality_of(recording, track))
 
 
 def open_recording(
-    kind: str, folder: Path, anchor: RecordingAnchor | None = None, topic: str | None = None
+    kind: str,
+    folder: Path,
+    anchor: RecordingAnchor | None = None,
+    topic: str | None = None,
+    choices: Choices = DEFAULTS,
 ) -> Recording:
     """A recording of a known format, or of the one that it is found to be of; ImportDriveError when it is none."""
     if kind not in (*FORMATS, AUTO):
         raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)} and {AUTO}")
     found = format_of(folder) if kind == AUTO else kind
-    if found == "mcap":
-        return open_mcap_clouds(folder, anchor, topic)
-    return FORMATS[found](folder, anchor)
+    choices = replace(choices, anchor=anchor or choices.anchor, topic=topic or choices.topic)
+    if found == "mcap" and is_foxglove_or_own(folder):
+        recording = open_mcap_clouds(folder, choices.anchor, choices.topic)
+    elif found in CHOOSING or found == "mcap":
+        recording = CHOOSING.get(found, open_ros)(folder, choices.anchor, choices)
+    else:
+        recording = FORMATS[found](folder, choices.anchor)
+    return as_chosen(_with_entries(recording, found, folder), folder, choices)
+
+
+def _with_entries(recording: Recording, found: str, folder: Path) -> Recording:
+    """The recording with a list of what it holds, where its reader gives none."""
+    if recording.entries:
+        return recording
+    entries = [Entry(str(folder), f"{found} scans", len(recording), recording.sensor_model, "scans")]
+    held = (("fixes", recording.gnss, "place"), ("speed and yaw rate", recording.motion, "motion"))
+    entries += [Entry("", kind, len(items), "", used) for kind, items, used in held if items]
+    if recording.track is not None:
+        entries.append(Entry("", "poses", len(recording.track), "", "track"))
+    return replace(recording, entries=tuple(entries))
 
 
 def write_drive(
@@ -127,27 +218,46 @@ def write_drive(
     scans: str = "all",
     vehicle: str = "recorded",
     progress: Progress = no_progress,
+    *,
+    stand_ins: bool = False,
 ) -> Imported:
-    """Write the chosen scans of a recording whose track (T_map_vehicle of all scans) is known."""
+    """Write the chosen scans of a recording whose track (T_map_vehicle of all scans) is known.
+
+    stand_ins: where the recording has no fixes or no motion, compute them from the track; the header says so.
+    """
     chosen, read = chosen_scans(scans, len(recording)), list[Cleaned]()
-    with DriveWriter(out, _header(recording, f"{recording.name}-{scans}".replace(":", "-"), vehicle)) as writer:
-        for item in _items(recording, track, chosen, read):
+    held: dict[StandIn, bool] = {"gnss": bool(recording.gnss), "motion": bool(recording.motion)}
+    missing = [one for one, measured in held.items() if not measured]
+    computed = tuple(missing) if stand_ins else ()
+    header = _header(recording, f"{recording.name}-{scans}".replace(":", "-"), vehicle)
+    with DriveWriter(out, replace(header, stand_ins=computed)) as writer:
+        for item in _items(recording, track, chosen, read, computed):
             writer.add(item)
             progress("writing scans", len(read), len(chosen))
-        return _imported(recording, read)  # inside: a drive without any scan is not written
+        return _imported(recording, read, _missing_notes(missing, stand_ins))
 
 
-def _imported(recording: Recording, read: list[Cleaned]) -> Imported:
+def _missing_notes(missing: list[StandIn], stand_ins: bool) -> tuple[str, ...]:
+    """What the recording did not measure, and what the drive has instead."""
+    if not missing:
+        return ()
+    what = " and no ".join({"gnss": "GNSS", "motion": "speed and yaw rate"}[one] for one in missing)
+    if stand_ins:
+        return (f"no {what} measured: computed from the poses and marked so: errors against them are circular",)
+    return (f"no {what} measured: the drive has none (`gnd localise` and vehicles need them: --stand-ins)",)
+
+
+def _imported(recording: Recording, read: list[Cleaned], notes: tuple[str, ...]) -> Imported:
     empty = sum(one.scan is None for one in read)
     if empty == len(read):
         raise ImportDriveError(f"{recording.name}: none of {len(read)} scans has a usable point")
     lost = sum(one.not_finite for one in read), sum(one.far for one in read)
-    return Imported(len(read) - empty, empty, *lost, notes=recording.notes)
+    return Imported(len(read) - empty, empty, *lost, notes=(*recording.notes, *notes))
 
 
 def _header(recording: Recording, drive_id: str, vehicle: str) -> DriveHeader:
     return DriveHeader(
-        drive_id=drive_id,
+        drive_id=drive_id_of(drive_id),
         vehicle=vehicle,
         sensor_model=recording.sensor_model,
         anchor=recording.anchor.frame,
@@ -157,7 +267,13 @@ def _header(recording: Recording, drive_id: str, vehicle: str) -> DriveHeader:
         sweep_ns=recording.sweep_ns,
         mount=recording.mount,
         mount_sigma=recording.mount_sigma,
+        nowhere=not recording.placed,
     )
+
+
+def drive_id_of(name: str) -> str:
+    """A name that a drive may have: letters, digits, dots, dashes; its end, where it is too long."""
+    return re.sub(r"[^A-Za-z0-9._-]", "_", name)[-64:] or "drive"
 
 
 def prepared(recording: Recording, progress: Progress = no_progress) -> tuple[Recording, Trajectory]:
@@ -172,7 +288,8 @@ def prepared(recording: Recording, progress: Progress = no_progress) -> tuple[Re
         return replace(recording, track=track), track
     recording, track = with_mount(recording, lidar_odometry(recording, progress))
     track = Trajectory(track.t_ns, T_inverse(track.T_dst_vehicle[0]) @ track.T_dst_vehicle)
-    return recording, _over_the_fixes(recording, track)
+    laid = _over_the_fixes(recording, track)
+    return replace(recording, notes=(*recording.notes, *_heading_note(recording, laid))), laid
 
 
 def _with_times(recording: Recording) -> Recording:
@@ -193,34 +310,50 @@ def _over_the_fixes(recording: Recording, track: Trajectory) -> Trajectory:
 
 
 def _T_map_first(recording: Recording, track: Trajectory) -> F64:
-    """Heading and position that lay the track over the fixes, least squares; the identity without fixes."""
-    t_ns = np.array([fix.t_ns for fix in recording.gnss], np.int64)
-    within = (t_ns >= track.t_ns[0]) & (t_ns <= track.t_ns[-1])
-    if within.sum() < 2:
-        return np.eye(4)
-    fixes = [fix for fix, inside in zip(recording.gnss, within, strict=True) if inside]
-    p_map = recording.anchor.frame.enu_from_geodetic(*np.array([(f.lat_rad, f.lon_rad, f.height_m) for f in fixes]).T)
-    return fit_heading_and_position(track.at(t_ns[within])[:, :3, 3], p_map)
+    """Heading and position that lay the track over the fixes, least squares; the anchor's where fixes do not tell."""
+    start = recording.anchor.T_map_start
+    within = fixes_within(recording, track)
+    if len(within) < 2:
+        return start
+    p_map = recording.anchor.frame.enu_from_geodetic(*np.array([(f.lat_rad, f.lon_rad, f.height_m) for f in within]).T)
+    T = track.at(np.array([fix.t_ns for fix in within], np.int64))
+    antenna = T[:, :3, 3] + T[:, :3, :3] @ np.array(recording.lever_m)
+    if recording.anchor.heading_deg is None:
+        return fit_heading_and_position(antenna, p_map)
+    start[:3, 3] = (p_map - antenna @ start[:3, :3].T).mean(axis=0)
+    return start
 
 
-def fit_heading_and_position(p_src_m: F64, p_dst_m: F64) -> F64:
-    """(4, 4) T_dst_src, turned about the vertical only, that brings points (N, 3) closest to points (N, 3)."""
-    middle_src, middle_dst = p_src_m.mean(axis=0), p_dst_m.mean(axis=0)
-    a, b = (p_src_m - middle_src)[:, :2], (p_dst_m - middle_dst)[:, :2]
-    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    T = np.eye(4)
-    T[:3, :3] = exp_so3([0.0, 0.0, yaw])
-    T[:3, 3] = middle_dst - T[:3, :3] @ middle_src
-    return T
+def _heading_note(recording: Recording, track: Trajectory) -> tuple[str, ...]:
+    """A warning where the fixes do not tell the heading: the vehicle hardly moved against what they are off."""
+    within = fixes_within(recording, track)
+    if recording.anchor.heading_deg is not None:
+        return ()
+    if len(within) < 2:
+        return ("heading not known: the first pose looks east (--anchor LAT,LON,HEIGHT,HEADING gives it)",)
+    p = track.at(np.array([fix.t_ns for fix in within], np.int64))[:, :2, 3]
+    spread_m = float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum()))
+    sigma_deg = float(np.degrees(np.median([fix.sigma_m for fix in within]) / max(spread_m, 1e-9)))
+    if sigma_deg <= LEAST_SURE_HEADING_DEG:
+        return ()
+    return (
+        f"warning: heading known to {min(sigma_deg, 180.0):.0f}° only: the {len(within)} fixes lie too close to each"
+        " other for what they are off (--anchor LAT,LON,HEIGHT,HEADING gives it)",
+    )
 
 
 def _items(
-    recording: Recording, track: Trajectory, chosen: NDArray[np.int64], read: list[Cleaned]
+    recording: Recording,
+    track: Trajectory,
+    chosen: NDArray[np.int64],
+    read: list[Cleaned],
+    computed: tuple[StandIn, ...],
 ) -> Iterator[DriveItem]:
     """Everything of the drive, the small things of its span first; what was read is noted in `read`."""
     first, last = int(recording.t_ns[chosen[0]]) - AROUND_NS, int(recording.t_ns[chosen[-1]]) + AROUND_NS
-    small: list[MotionSample | GnssFix | ReferencePose] = [*(recording.motion or motion_of(track))]
-    small += recording.gnss or fixes_of(recording, track)
+    small: list[MotionSample | GnssFix | ReferencePose] = [*recording.motion, *recording.gnss]
+    small += motion_of(track) if "motion" in computed else []
+    small += fixes_of(recording, track) if "gnss" in computed else []
     small += [ReferencePose(int(t), T) for t, T in zip(track.t_ns, track.T_dst_vehicle, strict=True)]
     within = [item for item in small if first <= item.t_ns <= last]
     items = deque(sorted(within, key=lambda item: item.t_ns))
@@ -247,7 +380,7 @@ def motion_of(track: Trajectory) -> list[MotionSample]:
 
 
 def fixes_of(recording: Recording, track: Trajectory) -> list[GnssFix]:
-    """The track's positions as fixes of `GNSS_SIGMA_M`, for recordings without any."""
+    """The track's positions as fixes of `GNSS_SIGMA_M`, for recordings without any: stand-ins."""
     lat, lon, height = recording.anchor.frame.geodetic_from_enu(track.T_dst_vehicle[:, :3, 3])
     return [
         GnssFix(int(t), float(a), float(o), float(h), GNSS_SIGMA_M)

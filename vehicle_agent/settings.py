@@ -7,9 +7,9 @@ from typing import Any
 from gnd.fleet_bus.settings_file import layers_of
 from gnd.gnd_map.config import to_mapping
 from gnd.gnd_map.settings import from_settings, merged, plain_settings
+from gnd.schemas.feature_layer import declared_layers, named_layer
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.detect.parameters import DetectParameters
-from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 
 
 def load_agent(
@@ -38,17 +38,20 @@ def agent_of(given: Mapping[str, Any], *, where: str = "agent") -> AgentConfig:
     """An agent with the given settings; the mode of detection chooses the defaults of detection.
 
     Args:
-        given: nested mapping; `features.layers` may hold names of known layers instead of tables.
+        given: nested mapping; `features.layers` may hold names of known or declared layers instead of tables.
         where: they come from, for messages.
 
     Raises:
         ConfigError: as of `load_agent`.
+        LayerError: a layer that nobody has declared.
     """
-    values = merged({"vehicle": "vehicle"}, _defaults_of_mode(given), given)
+    values = merged({"vehicle": "vehicle", "drive": None}, _defaults_of_mode(given), given)
     values.setdefault("work_dir", f"runs/{values['vehicle']}")
     features = values.get("features")
     if isinstance(features, Mapping) and isinstance(layers := features.get("layers"), list | tuple):
-        values["features"] = {**features, "layers": [_table(layer) for layer in layers]}
+        declared = declared_layers(values.get("feature_layer", []), where)
+        tables = [to_mapping(named_layer(one, declared)) if isinstance(one, str) else one for one in layers]
+        values["features"] = {**features, "layers": tables}
     return from_settings(AgentConfig, values, where=where)
 
 
@@ -57,7 +60,3 @@ def _defaults_of_mode(given: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(detect, Mapping) and detect.get("mode") == "paper":
         return {"detect": plain_settings(DetectParameters.paper())}
     return {}
-
-
-def _table(layer: object) -> object:
-    return to_mapping(FeatureParameters.of(layer).layers[0]) if isinstance(layer, str) else layer

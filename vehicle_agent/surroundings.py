@@ -12,15 +12,17 @@ from gnd.gnd_map.errors import TileError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.tile_client.exchange import Fetched
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
-from gnd.vehicle_agent.link.download import Fetched, TileFetcher
+from gnd.vehicle_agent.link.download import TileFetcher
 from gnd.vehicle_agent.link.plan import Need, in_time, needs
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
-AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
+AHEAD_S = 15.0  # tiles are asked for so long in advance, and at least `ahead_m`; longer than `LEAD_S`
 LINK_SHARE = 0.8  # part of the link's rate that the plan counts on
+AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
 FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not show how high the world is
 
 
@@ -98,7 +100,7 @@ class Surroundings:
         return True
 
     def _ahead_m(self, place: Place) -> float:
-        by_speed_m = self._parameters.ahead_s * abs(place.speed_mps)
+        by_speed_m = AHEAD_S * abs(place.speed_mps)
         return max(self._parameters.ahead_m, AHEAD_STEP_M * math.ceil(by_speed_m / AHEAD_STEP_M))
 
     def _look(self, place: Place) -> None:

@@ -1,6 +1,7 @@
 """The tiles around the vehicle, from a map at hand: a store, a file, a world in memory; without a bus."""
 
-from typing import Final, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,6 +23,14 @@ class TileSource(Protocol):
 
     def tile(self, tile_id: TileId) -> Tile | None:
         """The tile of that id, or None where the map has none."""
+
+
+@runtime_checkable
+class DistantTileSource(TileSource, Protocol):
+    """A source that is asked for many tiles at once."""
+
+    def tiles_of(self, wanted: Sequence[TileId]) -> Mapping[TileId, Tile]:
+        """Those of the wanted tiles that the map has."""
 
 
 class TilesAtHand:
@@ -56,8 +65,14 @@ class TilesAtHand:
         for tile_id in left_behind(frame, self._map.tiles, here, p.forget_m):
             if not self._touched(tile_id):
                 self._map.remove_tile(tile_id)
-        for tile_id in sorted(set(tiles_along(frame, here[None], p.near_m)) - set(self._map.tiles)):
-            self._hold(tile_id, self._source.tile(tile_id))
+        needed = sorted(set(tiles_along(frame, here[None], p.near_m)) - set(self._map.tiles))
+        if isinstance(self._source, DistantTileSource):
+            found = self._source.tiles_of(needed)
+            for tile_id in needed:
+                self._hold(tile_id, found.get(tile_id))
+        else:
+            for tile_id in needed:
+                self._hold(tile_id, self._source.tile(tile_id))
 
     def _hold(self, tile_id: TileId, tile: Tile | None) -> None:
         try:

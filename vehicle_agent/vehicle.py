@@ -4,14 +4,13 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gnd.schemas.doubt import tiles_by_reason
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
-from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.traffic import TrafficLine, TrafficSample
 from gnd.vehicle_agent.config import AgentConfig
@@ -21,14 +20,19 @@ from gnd.vehicle_agent.link.telemetry import Telemetry
 from gnd.vehicle_agent.link.tiles_on_the_bus import TilesOnTheBus
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.memory import MemoryMeter
-from gnd.vehicle_agent.pipeline import Pipeline, VehiclePipeline
+from gnd.vehicle_agent.pipeline import Output, Pipeline, VehiclePipeline
+from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.result import PoseEvaluation
-from gnd.vehicle_agent.sources.recording import first_fix, paced
-from gnd.vehicle_agent.sources.world_clock import in_common_time
+from gnd.vehicle_agent.sources.live import LiveError
+from gnd.vehicle_agent.sources.opening import Source, open_source
 from gnd.vehicle_agent.way import WAY_FILE, Way
 
 _log = logging.getLogger(__name__)
+
+
+def _shown_to_nobody(_output: Output, _place: Place) -> None:
+    pass
 
 
 @dataclass(slots=True)
@@ -54,8 +58,7 @@ class AgentVehicle:
     """Everything that one drive needs; made by `open_vehicle`, owned by the agent's main thread."""
 
     config: AgentConfig
-    header: DriveHeader
-    items: Iterator[DriveItem]
+    source: Source
     stop: threading.Event
     link: Link
     pipeline: VehiclePipeline
@@ -64,24 +67,24 @@ class AgentVehicle:
     bus: OnTheBus
     started_s: float = field(default_factory=time.monotonic)
     memory: MemoryMeter = field(default_factory=MemoryMeter)
-    damage: SchemaError | None = None
+    damage: SchemaError | LiveError | None = None
+    show: Callable[[Output, Place], None] = _shown_to_nobody
 
     def drive(self) -> Iterator[DriveItem]:
-        """The recording in time order, at its pace and in the common time, until its end or `stop`.
+        """Measurements in time order, until the end of the recording or `stop`.
 
-        A recording that turns out to be damaged on the way ends there: what was seen until then is still reported, and
-        `damage` says why.
+        A recording that turns out to be damaged on the way ends there, and so does a live drive whose time goes back:
+        what was seen until then is still reported, and `damage` says why.
         """
-        items = in_common_time(paced(self.items, self.config.pace, self.stop), self.config.departure, self.stop)
         try:
-            for item in items:
+            for item in self.source.items:
                 if self.stop.is_set():
                     return
                 if isinstance(item, ReferencePose):
                     self.evaluation.take_reference(item)  # for the account of errors only
                 else:
                     yield item
-        except SchemaError as damage:
+        except (SchemaError, LiveError) as damage:
             self.damage = damage
             _log.error("%s: the drive ends at %d ns: %s", self.config.vehicle, self.pipeline.place.t_ns, damage)
 
@@ -89,17 +92,25 @@ class AgentVehicle:
         """Feed the pipeline, and keep the books on poses, way and memory."""
         if isinstance(item, Scan):
             self.memory.count_scan()
-        self.evaluation.estimates += self.pipeline.push(item).poses
+        output = self.pipeline.push(item)
+        self.evaluation.estimates += output.poses
+        self.show(output, self.pipeline.place)
         self.way.note(self.pipeline.place)
         self.link.ledger.set_position(self.pipeline.place.odometer_m, item.t_ns)
 
     def finish(self) -> None:
         """The drive has ended: what waits is judged, decided and reported."""
-        self.evaluation.estimates += self.pipeline.finish().poses
+        output = self.pipeline.finish()
+        self.evaluation.estimates += output.poses
+        self.show(output, self.pipeline.place)
 
     def upload(self) -> None:
-        """Wait until the cloud has all that it wants of the reports, for a bounded time."""
-        if not self.link.sender.drain(self.config.report.drain_s, self.stop):
+        """Wait until the cloud has all that it wants of the reports, for a bounded time.
+
+        A live drive is ended by `stop`, so it is waited for all the same.
+        """
+        stop = threading.Event() if self.config.live.source else self.stop
+        if not self.link.sender.drain(self.config.report.drain_s, stop):
             _log.warning("%s: %d reports are not released", self.config.vehicle, self.link.outbox.counts().open)
 
     def sample(self) -> TrafficSample:
@@ -130,15 +141,16 @@ class AgentVehicle:
         """The results of the drive, as plain values."""
         return {
             "vehicle": self.config.vehicle,
-            "drive_id": self.header.drive_id,
-            "sensor_model": self.header.sensor_model,
-            "finished": not self.stop.is_set() and self.damage is None,
+            "drive_id": self.source.header.drive_id,
+            "sensor_model": self.source.header.sensor_model,
+            "finished": self.damage is None and (bool(self.config.live.source) or not self.stop.is_set()),
             "wall_s": round(time.monotonic() - self.started_s, 3),
             "distance_km": round(self.pipeline.place.odometer_m / 1000, 5),
             "scans_refined": len(self.evaluation.estimates),
             "scans_bad": dict(self.pipeline.guard.bad),
             **self.pipeline.account(),
             **self._link_counts(),
+            "live": self.source.account(),
             "localisation": self.evaluation.errors(),
             "memory_mb": self.memory.read(),
         }
@@ -165,19 +177,26 @@ class AgentVehicle:
 
 @contextmanager
 def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[AgentVehicle]:
-    """Read the recording's head, join the bus and put the parts together; closes all in reverse order.
+    """Open the recording or the sensors, join the bus and put the parts together; closes all in reverse order.
 
     Raises:
         DriveError: the recording cannot be read.
-        VehicleError: it has no GNSS fix to start from, or cache or outbox cannot be opened.
+        VehicleError: there is no position to start from, or cache or outbox cannot be opened.
     """
-    header, (fix, items) = read_header(config.drive), first_fix(read_drive(config.drive), config.drive)
-    with open_link(config) as link, open_feature_tiles(config, link, stop) as feature_tiles:
+    with (
+        open_source(config, stop) as source,
+        open_link(config) as link,
+        open_feature_tiles(config, link, stop) as feature_tiles,
+    ):
         bus = OnTheBus(config, link, feature_tiles, stop)
-        pipeline = _pipeline(header, fix, bus)
-        evaluation = PoseEvaluation.between(pipeline.place.frame, header.anchor)
+        pipeline = _pipeline(source.header, source.fix, bus)
+        evaluation = PoseEvaluation.between(pipeline.place.frame, source.header.anchor)
         with Way(config.work_dir / WAY_FILE, pipeline.tile) as way:
-            vehicle = AgentVehicle(config, header, items, stop, link, pipeline, evaluation, way, bus)
+            vehicle = AgentVehicle(config, source, stop, link, pipeline, evaluation, way, bus)
+            if source.ros2 is not None:
+                from gnd.vehicle_agent.link.ros2_output import Ros2Output
+
+                vehicle.show = Ros2Output(source.ros2.node, pipeline).take
             telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample)
             try:
                 yield vehicle

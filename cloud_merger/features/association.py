@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters, gate_of
 from gnd.cloud_merger.features.rls import PlaceEstimate
 from gnd.cloud_merger.features.shapes import across
 from gnd.gnd_map.arrays import F64
@@ -43,7 +43,7 @@ def pairs(
     possible = np.isfinite(cost)
     if not possible.any():
         return []
-    alone = np.full((len(measured), len(measured)), cost[possible].max() + parameters.gate_of(3))
+    alone = np.full((len(measured), len(measured)), cost[possible].max() + gate_of(3))
     rows, columns = linear_sum_assignment(np.hstack([np.where(possible, cost, _NEVER), alone]))
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if j < len(known) and possible[i, j]]
 
@@ -56,7 +56,7 @@ def costs(measured: Sequence[PlaceEstimate], known: Sequence[PlaceEstimate], par
     near = reach_m <= (parameters.reach_m if of_point else FEATURE_LINE_REACH_M)
     offset = np.where(near[..., None], offset, 0.0)
     square = np.einsum("ijk,ijk->ij", offset, np.linalg.solve(S, offset[..., None])[..., 0])
-    gate = np.where(S[..., 2, 2] > HEIGHT_KNOWN_M2, parameters.gate_of(2), parameters.gate_of(3))
+    gate = np.where(S[..., 2, 2] > HEIGHT_KNOWN_M2, gate_of(2), gate_of(3))
     area = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] ** 2
     return np.where(near & (square <= gate), square + np.log(area), np.inf)
 

@@ -4,21 +4,20 @@ Every refusal names the tile, the feature and the numbers; the report goes to qu
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnd.cloud_merger.errors import BadReport, MergerError
+from gnd.cloud_merger.errors import BadReport
 from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.errors import FeatureError
 from gnd.gnd_map.features import UNKNOWN_HEIGHT_M2, check_simple_polyline, full_covariance
 from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.feature_change import LANE_KINDS, FeatureChange, Found
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureReport
 
 _ROUNDING: Final = 1.01
@@ -38,35 +37,28 @@ _MIN_VERDICTS: Final = 5
 """From so many judged map features on the share of deleted ones is looked at."""
 _MAX_DELETED_SHARE: Final = 0.5
 """A drive that finds a larger share of the map's features gone has not looked, or lies."""
+_MAX_FEATURES_OF_TILE: Final = 256
+"""Found and judged features of one tile of 38 m."""
+_MAX_VERTICES: Final = 512
+"""Vertices of a found polyline in one tile."""
 _DUPLICATE_M: Final = 0.1
 """Two found features of one kind that are nearer than this and alike are one, sent twice."""
 
 
-@dataclass(frozen=True, slots=True)
-class FeatureLimits:
-    """What a statement about features may say."""
-
-    max_features_of_tile: int = setting(256, "Found and judged features of one tile of 38 m.", least=1)
-    max_vertices: int = setting(512, "Vertices of a found polyline in one tile.", least=1)
-
-    def __post_init__(self) -> None:
-        check_settings(self, MergerError)
-
-
-def check_feature_report(report: FeatureReport, limits: FeatureLimits, ids_of: IdsOf) -> None:
+def check_feature_report(report: FeatureReport, ids_of: IdsOf, layer: LayerParameters | None = None) -> None:
     """Refuse a report that cannot be a true statement about this map.
 
     Args:
         report: that came.
-        limits: what it may say.
         ids_of: what the map holds.
+        layer: its declaration; None: the layer takes any kind and geometry.
 
     Raises:
         BadReport: says what is wrong with it, and where, with numbers.
     """
     _check_verdicts(report)
     for change in report.tiles:
-        _check_amount(change, limits)
+        _check_amount(change)
         _check_base(change, ids_of)
         for seen in change.seen:
             if seen.position_m is not None and seen.cov_m2 is not None:
@@ -74,7 +66,10 @@ def check_feature_report(report: FeatureReport, limits: FeatureLimits, ids_of: I
                 _check_covariance(name, seen.cov_m2)
                 _check_inside(name, change.tile, seen.position_m)
         for number, found in enumerate(change.found):
-            _check_found(f"tile {change.tile}, found {found.kind} {number}", found, limits)
+            name = f"tile {change.tile}, found {found.kind} {number}"
+            _check_found(name, found)
+            if layer is not None:
+                _check_of_layer(name, found, layer)
         _check_duplicates(change)
 
 
@@ -83,16 +78,16 @@ def _check_verdicts(report: FeatureReport) -> None:
     gone = judged.count("absent")
     if len(judged) >= _MIN_VERDICTS and gone > _MAX_DELETED_SHARE * len(judged):
         raise BadReport(
-            f"{gone} of {len(judged)} judged features are said to be deleted, the limit is "
+            f"{gone} of {len(judged)} judged features are called deleted, the limit is "
             f"{_MAX_DELETED_SHARE:g} of {_MIN_VERDICTS} or more: so much does not go at once"
         )
 
 
-def _check_amount(change: FeatureChange, limits: FeatureLimits) -> None:
-    if change.n_features > limits.max_features_of_tile:
+def _check_amount(change: FeatureChange) -> None:
+    if change.n_features > _MAX_FEATURES_OF_TILE:
         raise BadReport(
             f"tile {change.tile}: {len(change.found)} features found, {len(change.seen)} judged, the limit is "
-            f"{limits.max_features_of_tile} together"
+            f"{_MAX_FEATURES_OF_TILE} together"
         )
 
 
@@ -110,10 +105,18 @@ def _check_base(change: FeatureChange, ids_of: IdsOf) -> None:
         )
 
 
-def _check_found(name: str, found: Found, limits: FeatureLimits) -> None:
+def _check_of_layer(name: str, found: Found, layer: LayerParameters) -> None:
+    """Refuse what a declared layer does not hold."""
+    if found.kind not in layer.kinds:
+        raise BadReport(f"{name}: layer {layer.name} is declared to hold {', '.join(layer.kinds)}")
+    if (len(found.points_m) == 1) != (layer.geometry == "point"):
+        raise BadReport(f"{name} has {len(found.points_m)} vertices, layer {layer.name} holds {layer.geometry}s")
+
+
+def _check_found(name: str, found: Found) -> None:
     _check_covariance(name, found.cov_m2)
-    if len(found.points_m) > limits.max_vertices:
-        raise BadReport(f"{name} has {len(found.points_m)} vertices, the limit is {limits.max_vertices} a tile")
+    if len(found.points_m) > _MAX_VERTICES:
+        raise BadReport(f"{name} has {len(found.points_m)} vertices, the limit is {_MAX_VERTICES} a tile")
     if len(found.points_m) > 2 and found.kind.startswith(LANE_KINDS):
         try:
             check_simple_polyline(name, found.points_m)

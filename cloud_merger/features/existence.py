@@ -15,7 +15,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.feature_change import GRID
 
 FEATURE_PRIOR: Final = 0.95
-"""What the map itself says of its features never weighs more than this. λ_HD of SLAMCU, Eq. (3)."""
+"""The evidence of the map for its own features never weighs more than this. λ_HD of SLAMCU, Eq. (3)."""
 FEATURE_ABSENCE: Final = 0.8
 """Mass of "absent" of a vehicle that viewed a place without finding what others found there."""
 FEATURE_VIEW_MARGIN_M: Final = 0.5
@@ -46,25 +46,25 @@ def capped(existence: Existence, most: float) -> Existence:
 
 
 def prior_of(track: FeatureTrack) -> Existence:
-    """What the map itself says of a feature."""
+    """The evidence of the map for a feature."""
     return VACUOUS if track.epoch is None else capped(track.epoch.existence, FEATURE_PRIOR)
 
 
 def verdict(prior: Existence, votes: Iterable[Existence]) -> Existence:
-    """What the map (`prior_of`) and votes, one a vehicle and discounted already, say together."""
+    """What the map (`prior_of`) and votes, one a vehicle and discounted already, together."""
     return capped(pooled([prior, *votes]), FEATURE_CEILING)
 
 
-def add_views(tile: TileId, tracks: FeatureTracks, said: Sequence[Statement], bases: Bases) -> None:
-    """Let those vote "absent" who looked where a feature is said to be, had it not in their map, and found nothing.
+def add_views(tile: TileId, tracks: FeatureTracks, statements: Sequence[Statement], bases: Bases) -> None:
+    """Let those vote "absent" who looked where a feature is claimed, had it not in their map, and found nothing.
 
     Those who passed before anyone had seen it speak of another time. A report whose base is not known abstains.
     """
     absent, names_of = miss(FEATURE_ABSENCE), tracks.names_of()
     for track in tracks.all:
         cells, names = _cells(tile, track, FEATURE_VIEW_MARGIN_M), names_of[track.serial]
-        for number in range(max(track.first, 0), len(said)):
-            one = said[number]
+        for number in range(max(track.first, 0), len(statements)):
+            one = statements[number]
             if one.viewed & cells != cells or number in track.votes or one.base_sha is None:
                 continue
             known = bases.get(one.base_sha) if one.base_sha else {}

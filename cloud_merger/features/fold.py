@@ -1,4 +1,4 @@
-"""A closed window of a tile of a feature layer, folded: what its hypotheses have come to, the start of the next."""
+"""A closed window of a tile of a feature layer, folded: the state of its hypotheses, from which the next begins."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -48,9 +48,9 @@ def fold(merged: MergedFeatures, parameters: FeatureMergeParameters, day: int) -
     tracks = []
     for k, story in enumerate(stories):
         serial = story.track.serial
-        told = tuple((witness[number], vote) for number, vote in votes[serial])
+        kept_votes = tuple((witness[number], vote) for number, vote in votes[serial])
         names = _names(what, story, cited)
-        tracks.append(_remembered(story, told, names, apart.get(k, frozenset()), days[serial]))
+        tracks.append(_remembered(story, kept_votes, names, apart.get(k, frozenset()), days[serial]))
     return LayerMemory(tuple(tracks), tuple(what.report_ids[number] for number in heard))
 
 
@@ -138,7 +138,7 @@ def _names(what: Hypotheses, story: Story, cited: set[int]) -> tuple[int, ...]:
 
 
 def _apart(tracks: Sequence[FeatureTrack], reach_m: float) -> Mapping[int, frozenset[int]]:
-    """Which of them are not one although they might be by what is known of them, since a report has told them apart."""
+    """Which of them are not one although they might be by their estimates, since a report has distinguished them."""
     found: dict[int, set[int]] = defaultdict(set)
     like: dict[tuple[str, bool], list[int]] = defaultdict(list)
     for k, track in enumerate(tracks):

@@ -1,15 +1,18 @@
-"""Reports about feature layers between bus and store: checked against the map, told to the tiles around, read again."""
+"""Reports about feature layers between bus and store: checked against the map, spread to the tiles around."""
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from functools import lru_cache
 from threading import Lock
 from typing import Final
 
 from gnd.cloud_merger.errors import BadReport
-from gnd.cloud_merger.features.check import FeatureLimits, check_feature_report
+from gnd.cloud_merger.features.check import check_feature_report
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.features.spread import spread
 from gnd.gnd_map.features import Feature, is_feature_layer
 from gnd.gnd_map.tile_id import LAT_TILES, LON_TILES, District, TileId
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureReport
 from gnd.schemas.keys import parse_change_key
 from gnd.tile_store.store import Store
@@ -71,13 +74,16 @@ class FeatureInbox:
 
     Args:
         store: of the map.
-        limits: what is refused.
-        reach_m: `FeatureMergeParameters.reach_m`.
+        parameters: of the merge.
+        layers: that are declared.
         reach_tiles: a tile that no layer holds may be this many tiles away from one that a layer holds.
     """
 
-    def __init__(self, store: Store, limits: FeatureLimits, reach_m: float, reach_tiles: int) -> None:
-        self._store, self._limits, self._reach_m, self._reach_tiles = store, limits, reach_m, reach_tiles
+    def __init__(
+        self, store: Store, parameters: FeatureMergeParameters, layers: Iterable[LayerParameters], reach_tiles: int
+    ) -> None:
+        self._store, self._parameters, self._reach_tiles = store, parameters, reach_tiles
+        self._layers = {layer.name: layer for layer in layers}
         self._contents = FeatureContents(store)
 
     def check(self, key: str, report: FeatureReport) -> None:
@@ -89,13 +95,14 @@ class FeatureInbox:
         layer, district = parse_change_key(key)
         if (report.layer, report.district) != (layer, district):
             raise BadReport(f"report for {report.layer} {report.district} came on the key of {layer} {district}")
-        check_feature_report(report, self._limits, lambda tile, sha: self._ids(layer, tile, sha))
+        check_feature_report(report, lambda tile, sha: self._ids(layer, tile, sha), self._layers.get(layer))
         for change in report.tiles:
             if not change.base_sha or self._contents.content(layer, change.tile, change.base_sha) is None:
                 self._check_reach(change.tile)
 
     def rows(self, report: FeatureReport, received_ns: int) -> list[ReportRow]:
         """What the store is to keep: one row for each tile that is to hear of it."""
+        parameters = self._parameters.of_layer(self._layers.get(report.layer))
         bases = {change.tile: change.base_sha for change in report.tiles}
         return [
             ReportRow(
@@ -107,7 +114,7 @@ class FeatureInbox:
                 part.encode(),
                 base_sha=bases.get(tile, _NO_BASE),
             )
-            for tile, part in spread(report, self._reach_m).items()
+            for tile, part in spread(report, parameters.reach_m).items()
         ]
 
     def _ids(self, layer: str, tile: TileId, sha: bytes) -> frozenset[int] | None:

@@ -1,7 +1,7 @@
-"""What a tile of a feature layer remembers of its closed windows: of each feature what its estimators have come to.
+"""What a tile of a feature layer remembers of its closed windows: of each feature the state of its estimators.
 
 Existence and place are recursive estimates, so they can be carried on: of a feature the votes of the vehicles that
-spoke last, what the measurements of the last vehicles come to, each on its own (so that one more of the same vehicle
+spoke last, the joint measurement of each of the last vehicles (so that one more of the same vehicle
 weighs what it adds), and those of all before as one place. What is carried is bounded of each feature, and of what a
 vehicle alone has found by vehicle: neither grows with the number of reports.
 """
@@ -44,13 +44,13 @@ class Vote:
     @property
     def denied(self) -> "Vote":
         """The same against the feature."""
-        said = self.existence
-        return Vote(self.vehicle, Existence(said.absent, said.exist, said.unknown), self.hits)
+        masses = self.existence
+        return Vote(self.vehicle, Existence(masses.absent, masses.exist, masses.unknown), self.hits)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Own:
-    """What the measurements of one vehicle come to.
+    """The measurements of one vehicle, fused.
 
     Attributes:
         vehicle: whose.
@@ -88,11 +88,11 @@ class Remembered:
         measured: of the vehicles that measured it last, in the order of their first measurements.
         known: the map's place with the measurements of all vehicles before those; None: neither.
         vehicles_before: how many these are, ...
-        ayes_before: ... how many whose votes are no longer among `votes` said that it exists, ...
+        ayes_before: ... how many whose votes are no longer among `votes` voted that it exists, ...
         hits_before: ... and their looks.
         gone: of the newest of those vehicles how often each has measured it: it may come back, ...
         ayes_gone: ... and of the newest of those votes whose and with how many looks.
-        apart: numbers of those with which it is not one: a report has told them apart.
+        apart: numbers of those with which it is not one: a report has distinguished them.
         day: `gnd.gnd_map.day` of the newest receipt of a report that speaks for it.
     """
 
@@ -162,9 +162,9 @@ class LayerMemory:
     def encode(self) -> bytes:
         """Bytes for the store: JSON, zstd. Floats come back bit for bit."""
         features = _MemoryTable()
-        tracks = [_told(track, features) for track in self.tracks]
-        said = {"format": _FORMAT, "witnesses": self.witnesses, "features": features.told, "tracks": tracks}
-        return zstandard.ZstdCompressor(level=_LEVEL).compress(json.dumps(said, separators=(",", ":")).encode())
+        tracks = [_track_row(track, features) for track in self.tracks]
+        row = {"format": _FORMAT, "witnesses": self.witnesses, "features": features.rows, "tracks": tracks}
+        return zstandard.ZstdCompressor(level=_LEVEL).compress(json.dumps(row, separators=(",", ":")).encode())
 
     @classmethod
     def decode(cls, body: bytes) -> "LayerMemory":
@@ -174,32 +174,32 @@ class LayerMemory:
             MergerError: it is damaged or of another format.
         """
         try:
-            said = json.loads(zstandard.ZstdDecompressor().decompress(body))
-            if said["format"] != _FORMAT:
-                raise MergerError(f"a memory of layers of format {said['format']}, this release reads {_FORMAT}")
-            features = [_feature(one) for one in said["features"]]
-            return cls(tuple(_remembered(one, features) for one in said["tracks"]), tuple(said["witnesses"]))
+            row = json.loads(zstandard.ZstdDecompressor().decompress(body))
+            if row["format"] != _FORMAT:
+                raise MergerError(f"a memory of layers of format {row['format']}, this release reads {_FORMAT}")
+            features = [_feature(one) for one in row["features"]]
+            return cls(tuple(_remembered(one, features) for one in row["tracks"]), tuple(row["witnesses"]))
         except (ValueError, KeyError, TypeError, IndexError, zstandard.ZstdError) as error:
             raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
 
 
 class _MemoryTable:
-    """Features, each told once: what is published is mostly what the map has."""
+    """Features, each once: what is published is mostly what the map has."""
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.rows: list[Any] = []
         self._number: dict[Feature, int] = {}
 
     def number(self, feature: Feature | None) -> int:
         if feature is None:
             return -1
         if feature not in self._number:
-            self._number[feature] = len(self.told)
-            self.told.append(_told_feature(feature))
+            self._number[feature] = len(self.rows)
+            self.rows.append(_feature_row(feature))
         return self._number[feature]
 
 
-def _told(track: Remembered, features: _MemoryTable) -> list[Any]:
+def _track_row(track: Remembered, features: _MemoryTable) -> list[Any]:
     known = [features.number(one) for one in (track.epoch, track.quoted, track.shown)]
     flags = [int(one) for one in (track.is_published, track.is_settled, track.is_away)]
     counts = [track.vehicles_before, track.ayes_before, track.hits_before, track.day]
@@ -213,8 +213,8 @@ def _told(track: Remembered, features: _MemoryTable) -> list[Any]:
     return [*head, known, flags, votes, measured, place, counts, sorted(track.apart), track.gone, track.ayes_gone]
 
 
-def _remembered(said: Sequence[Any], features: Sequence[Feature]) -> Remembered:
-    feature_id, kind, names, state, known, flags, votes, measured, place, counts, apart, gone, ayes = said
+def _remembered(row: Sequence[Any], features: Sequence[Feature]) -> Remembered:
+    feature_id, kind, names, state, known, flags, votes, measured, place, counts, apart, gone, ayes = row
     epoch, quoted, shown = (None if number < 0 else features[number] for number in known)
     vehicles_before, ayes_before, hits_before, day = counts
     is_published, is_settled, is_away = map(bool, flags)
@@ -245,32 +245,32 @@ def _remembered(said: Sequence[Any], features: Sequence[Feature]) -> Remembered:
     )
 
 
-def _masses(said: Existence) -> list[float]:
-    return [said.exist, said.absent, said.unknown, said.conflict]
+def _masses(row: Existence) -> list[float]:
+    return [row.exist, row.absent, row.unknown, row.conflict]
 
 
 def _place(place: PlaceEstimate) -> list[Any]:
     return [place.points_m.ravel().tolist(), place.cov_m2.ravel().tolist()]
 
 
-def _place_of(said: Sequence[Any]) -> PlaceEstimate:
-    points_m, cov_m2 = said
+def _place_of(row: Sequence[Any]) -> PlaceEstimate:
+    points_m, cov_m2 = row
     return PlaceEstimate(_array(points_m).reshape(-1, 3), _array(cov_m2).reshape(3, 3))
 
 
-def _told_feature(one: Feature) -> list[Any]:
+def _feature_row(one: Feature) -> list[Any]:
     head = [one.feature_id, one.kind, one.points_m.ravel().tolist(), one.cov_m2.tolist(), _masses(one.existence)]
     return [*head, one.attributes, one.part, one.cuts, one.hits, one.vehicles]
 
 
-def _feature(said: Sequence[Any]) -> Feature:
-    feature_id, kind, points_m, cov_m2, masses, attributes, *counts = said
+def _feature(row: Sequence[Any]) -> Feature:
+    feature_id, kind, points_m, cov_m2, masses, attributes, *counts = row
     points = _array(points_m).reshape(-1, 3)
     return Feature(feature_id, kind, points, _array(cov_m2), Existence(*masses), _attributes(attributes), *counts)
 
 
-def _attributes(said: Iterable[Sequence[str]]) -> Attributes:
-    return tuple((key, value) for key, value in said)
+def _attributes(row: Iterable[Sequence[str]]) -> Attributes:
+    return tuple((key, value) for key, value in row)
 
 
 def _array(values: Sequence[float]) -> F64:

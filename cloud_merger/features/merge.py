@@ -80,25 +80,25 @@ def merge_features(
             report about an unknown version says nothing of features that it does not name.
         refuted: reports that others contradict again and again, and whose each is (`refuted.py`): they are compared as
             all are, and say nothing.
-        memory: what the windows since the epoch that are closed have come to; None: there are none.
+        memory: the state that the closed windows since the epoch leave; None: there are none.
     """
     parameters = parameters or FeatureMergeParameters()
     own = FeatureTile.of(tile, 0, epoch)
     contents = contents_of({b"": (), own.sha: own.features, **(bases or {})})
     reports = list(reports)
-    said = statements_of(tile, reports, parameters.reach_m)
-    tracks = _tracks_of(tile, epoch, said, contents, parameters, memory)
-    tests = tests_of(heard(tracks.all), said, {one.report_id: one.last_ns for one in reports})
-    if out := left_out(said, tests, refuted):
-        said = tuple(one for one in said if one.report_id not in out)
-        tracks = _tracks_of(tile, epoch, said, contents, parameters, memory)
+    statements = statements_of(tile, reports, parameters.reach_m)
+    tracks = _tracks_of(tile, epoch, statements, contents, parameters, memory)
+    tests = tests_of(heard(tracks.all), statements, {one.report_id: one.last_ns for one in reports})
+    if out := left_out(statements, tests, refuted):
+        statements = tuple(one for one in statements if one.report_id not in out)
+        tracks = _tracks_of(tile, epoch, statements, contents, parameters, memory)
     stories = tuple(story_of(tile, track, parameters) for track in tracks.all)
-    told = [(story, outcome) for story in stories if (outcome := story.outcome())]
-    ids = (*(one.report_id for one in said), *(() if memory is None else memory.witnesses))
+    outcomes = [(story, outcome) for story in stories if (outcome := story.outcome())]
+    ids = (*(one.report_id for one in statements), *(() if memory is None else memory.witnesses))
     return MergedFeatures(
-        features=FeatureTile.of(tile, 0, [o.published for _, o in told if o.published is not None]).features,
-        estimates=tuple(sorted((o.estimate for _, o in told), key=lambda feature: feature.key)),
-        provenance=_provenance(told, ids),
+        features=FeatureTile.of(tile, 0, [o.published for _, o in outcomes if o.published is not None]).features,
+        estimates=tuple(sorted((o.estimate for _, o in outcomes), key=lambda feature: feature.key)),
+        provenance=_provenance(outcomes, ids),
         tests=tests,
         hypotheses=Hypotheses(stories, tracks.names_of(), ids),
     )
@@ -107,22 +107,22 @@ def merge_features(
 def _tracks_of(
     tile: TileId,
     epoch: Sequence[Feature],
-    said: Sequence[Statement],
+    statements: Sequence[Statement],
     contents: Bases,
     parameters: FeatureMergeParameters,
     memory: LayerMemory | None,
 ) -> FeatureTracks:
     tracks = FeatureTracks(epoch, contents, parameters, memory)
-    for number, statement in enumerate(said):
+    for number, statement in enumerate(statements):
         tracks.hear(number, statement)
     tracks.settle()
-    add_views(tile, tracks, said, contents)
+    add_views(tile, tracks, statements, contents)
     return tracks
 
 
-def _provenance(told: Iterable[tuple[Story, Outcome]], ids: Sequence[str]) -> dict[int, tuple[str, ...]]:
+def _provenance(outcomes: Iterable[tuple[Story, Outcome]], ids: Sequence[str]) -> dict[int, tuple[str, ...]]:
     found: dict[int, set[str]] = {}
-    for story, outcome in told:
+    for story, outcome in outcomes:
         if outcome.is_decided:
             # numbers below 0 are those of witnesses, who stand at the end
             found.setdefault(story.track.feature_id, set()).update(ids[number] for number in outcome.reports)
@@ -151,7 +151,7 @@ def merge_layer(
             parts.setdefault(tile, []).append(part)
     merged = {tile: merge_features(tile, epochs.get(tile, ()), parts[tile], parameters) for tile in sorted(parts)}
     refuted = refuted_of(test for one in merged.values() for test in one.tests)
-    again = {tile for tile, said in parts.items() if any(one.vehicle in refuted.values() for one in said)}
+    again = {tile for tile, some in parts.items() if any(one.vehicle in refuted.values() for one in some)}
     return {
         tile: merge_features(tile, epochs.get(tile, ()), parts[tile], parameters, refuted=refuted)
         if tile in again

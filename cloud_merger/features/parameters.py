@@ -1,24 +1,23 @@
 """How reports about features become changes: the parameters of the cloud merge of feature layers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Final
 
 from scipy.stats import chi2
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.gnd_map.settings import check_settings, setting
+from gnd.schemas.feature_layer import LayerParameters
+
+FEATURE_GATE: Final = 0.999
+"""Share of the good measurements that pass the innovation gate (a quantile of χ²)."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureMergeParameters:
     """How statements about features become changes."""
 
-    gate: float = setting(
-        0.999,
-        "Share of the good measurements that pass the innovation gate (a quantile of χ²).",
-        above=0,
-        below=1,
-    )
     reach_m: float = setting(
         15.0,
         "A measurement farther than this from a feature is never of it, whatever the covariances allow; less "
@@ -57,15 +56,16 @@ class FeatureMergeParameters:
     def __post_init__(self) -> None:
         check_settings(self, MergerError)
 
-    def gate_of(self, dimensions: int) -> float:
-        """The largest squared Mahalanobis distance of a measurement of 1, 2 or 3 dimensions that passes."""
-        return _quantile(self.gate, dimensions)
+    def of_layer(self, layer: LayerParameters | None) -> "FeatureMergeParameters":
+        """The same for a declared layer, which may have its own reach; None: it is not declared."""
+        return self if layer is None or layer.reach_m is None else replace(self, reach_m=layer.reach_m)
 
     def information_of(self, repeats: int) -> float:
         """What so many measurements by one vehicle weigh, in measurements."""
         return repeats / (1.0 + (repeats - 1) * self.repeat_correlation) if repeats else 0.0
 
 
-@lru_cache(maxsize=64)
-def _quantile(share: float, dimensions: int) -> float:
-    return float(chi2.ppf(share, dimensions))
+@lru_cache
+def gate_of(dimensions: int) -> float:
+    """The largest squared Mahalanobis distance of a measurement of 1, 2 or 3 dimensions that passes."""
+    return float(chi2.ppf(FEATURE_GATE, dimensions))

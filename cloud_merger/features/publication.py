@@ -282,9 +282,9 @@ class Story:
     def _agreed(self) -> Attributes:
         """What enough vehicles say of it, and more than say otherwise; of each vehicle its newest word."""
         newest = [own.attributes for own in self.measured.values()]
-        said = Counter(pair for attributes in newest for pair in attributes)
+        counts = Counter(pair for attributes in newest for pair in attributes)
         of_key: dict[str, list[tuple[int, str]]] = {}
-        for (key, value), n in said.items():
+        for (key, value), n in counts.items():
             of_key.setdefault(key, []).append((-n, value))
         best = {key: min(values) for key, values in of_key.items()}
         return tuple((key, value) for key, (n, value) in sorted(best.items()) if -n >= self._parameters.min_vehicles)

@@ -57,9 +57,9 @@ def heard(tracks: Sequence[FeatureTrack]) -> tuple[Heard, ...]:
     believed = [track for track in tracks if _ayes(track) >= OPPOSING]
     for track in tracks:
         newest = {vote.vehicle: (number, vote.existence.state) for number, vote in sorted(track.votes.items())}
-        told = {vehicle: said for vehicle, said in newest.items() if said[1] in STATES}
-        counts = Counter(state for _, state in told.values())
-        for vehicle, (number, state) in told.items():
+        clear = {vehicle: vote for vehicle, vote in newest.items() if vote[1] in STATES}
+        counts = Counter(state for _, state in clear.values())
+        for vehicle, (number, state) in clear.items():
             same, other = counts[state] - 1, sum(counts.values()) - counts[state]
             vehicles[number] = vehicle
             if same:
@@ -75,22 +75,26 @@ def heard(tracks: Sequence[FeatureTrack]) -> tuple[Heard, ...]:
     )
 
 
-def tests_of(found: Iterable[Heard], said: Sequence[Statement], last_ns: Mapping[str, int]) -> tuple[ShiftTest, ...]:
+def tests_of(
+    found: Iterable[Heard], statements: Sequence[Statement], last_ns: Mapping[str, int]
+) -> tuple[ShiftTest, ...]:
     """Its lines in the accounts of the vehicles, sorted by report id."""
     return tuple(
-        ShiftTest(said[one.number].report_id, one.vehicle, last_ns[said[one.number].report_id], one.is_contradicted,
-                  one.off_m if one.is_contradicted else 0.0, 0.0)
+        ShiftTest(
+            report_id := statements[one.number].report_id, one.vehicle, last_ns[report_id], one.is_contradicted,
+            one.off_m if one.is_contradicted else 0.0, 0.0,
+        )
         for one in found
     )  # fmt: skip
 
 
-def left_out(said: Sequence[Statement], tests: Iterable[ShiftTest], refuted: Mapping[str, str]) -> frozenset[str]:
+def left_out(statements: Sequence[Statement], tests: Iterable[ShiftTest], refuted: Mapping[str, str]) -> frozenset[str]:
     """The reports that say nothing about a tile: those refuted, and what else their vehicles say alone in this tile: a
     lost stretch does not end where a report does.
     """
     lost = set(refuted.values())
     alone = {test.report_id for test in tests if test.is_explained and test.vehicle in lost}
-    return frozenset(one.report_id for one in said if one.report_id in refuted or one.report_id in alone)
+    return frozenset(one.report_id for one in statements if one.report_id in refuted or one.report_id in alone)
 
 
 def refuted_of(tests: Iterable[ShiftTest]) -> dict[str, str]:

@@ -32,7 +32,7 @@ class PlaceEstimate:
 
     @classmethod
     def of(cls, points_m: F64, cov_m2: F64) -> "PlaceEstimate":
-        """From six values xx, xy, xz, yy, yz, zz. Of an unknown height one learns nothing, however often it is told."""
+        """From six values xx, xy, xz, yy, yz, zz. Of an unknown height one learns nothing, however often it comes."""
         cov = full_covariance(cov_m2)
         if cov[2, 2] > UNKNOWN_HEIGHT_M2 / 2:
             cov[2], cov[:, 2] = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""What lies near a tile's border is told to the neighbour too.
+"""What lies near a tile's border is reported to the neighbour too.
 
 A drive may know its place to metres only, so one and the same lamp is found by one vehicle in this tile, by another in
 the next. Both tiles hear of both, come to the same estimate by the same steps, and that tile alone publishes in which

@@ -77,8 +77,8 @@ def statements_of(tile: TileId, reports: Iterable[FeatureReport], reach_m: float
         for change in report.tiles:
             if change.tile in near:
                 changes.setdefault(change.tile, change)
-    said = [_statement(tile, key, vehicles[key], changes, reach_m) for key, changes in parts.items()]
-    return tuple(one for one in said if one.base_sha is not None or one.found)
+    statements = [_statement(tile, key, vehicles[key], changes, reach_m) for key, changes in parts.items()]
+    return tuple(one for one in statements if one.base_sha is not None or one.found)
 
 
 def _statement(
@@ -107,8 +107,8 @@ def _claims(tile: TileId, report_id: str, change: FeatureChange, reach_m: float)
 
 def _name(report_id: str, source: TileId, found: Found, taken: set[int]) -> int:
     """The same id in whichever tile it is merged: it comes from what was sent, and from how often that was sent."""
-    said = found.kind, np.ascontiguousarray(found.points_m, "<f8").tobytes()
-    name = feature_id_of(report_id, source.morton, *said)
+    content = found.kind, np.ascontiguousarray(found.points_m, "<f8").tobytes()
+    name = feature_id_of(report_id, source.morton, *content)
     while name in taken:
         name = feature_id_of(name, "again")
     taken.add(name)

@@ -46,9 +46,9 @@ class FeatureTrack:
         measured: by number of the report.
         votes: by number of the report; numbers below 0 are those of witnesses of closed windows.
         repeats: how often each vehicle has measured it.
-        before: what the closed windows have come to.
+        before: the state that the closed windows leave.
         serial: its number among all of the tile.
-        apart: serial numbers of those that a report of a closed window has told from it.
+        apart: serial numbers of those that a report of a closed window has distinguished from it.
     """
 
     feature_id: int
@@ -74,15 +74,15 @@ class FeatureTrack:
         return self.epoch is not None or self.quoted is not None
 
     def is_apart(self, other: "FeatureTrack") -> bool:
-        """Whether a report has told the two apart."""
+        """Whether a report has distinguished the two."""
         known = other.serial in self.apart or self.serial in other.apart
         return known or not self.votes.keys().isdisjoint(other.votes)
 
     @property
     def attributes(self) -> Attributes:
         """Those of the map, for what stands elsewhere now."""
-        said = self.epoch or self.quoted
-        return said.attributes if said else ()
+        known = self.epoch or self.quoted
+        return known.attributes if known else ()
 
     @property
     def first(self) -> int:
@@ -134,7 +134,7 @@ class FeatureTracks:
             self._remember(memory)
 
     def _remember(self, memory: LayerMemory) -> None:
-        """Begin with what the closed windows have come to."""
+        """Begin with the state that the closed windows leave."""
         n = len(memory.witnesses)
         for one in memory.tracks:
             votes = {number - n: vote for number, vote in one.votes}
@@ -149,18 +149,18 @@ class FeatureTracks:
             for name in one.names:
                 self._by_id.setdefault(name, [track])
 
-    def hear(self, report: int, said: Statement) -> None:
+    def hear(self, report: int, statement: Statement) -> None:
         """Take all that one report says: verdicts first, then what is found among what it has not judged."""
         judged: set[int] = set()
-        claims = list(said.found)
-        for seen in said.seen:
-            for track in self._named(seen.feature_id, said.base_sha):
+        claims = list(statement.found)
+        for seen in statement.seen:
+            for track in self._named(seen.feature_id, statement.base_sha):
                 judged.add(id(track))
-                elsewhere = self._judge(track, report, said, seen)
+                elsewhere = self._judge(track, report, statement, seen)
                 claims += [] if elsewhere is None else [elsewhere]
         for kind, is_point in sorted({(one.kind, len(one.place.points_m) == 1) for one in claims}):
             like = [one for one in claims if (one.kind, len(one.place.points_m) == 1) == (kind, is_point)]
-            self._associate(report, said, like, judged)
+            self._associate(report, statement, like, judged)
 
     def _named(self, feature_id: int, base_sha: bytes | None) -> Sequence[FeatureTrack]:
         """The tracks of a map feature; one that only an old version names begins anew, quoted from there."""
@@ -177,27 +177,27 @@ class FeatureTracks:
         self._by_id.setdefault(track.feature_id, []).append(track)
         return track
 
-    def _judge(self, track: FeatureTrack, report: int, said: Statement, seen: Seen) -> Claimed | None:
+    def _judge(self, track: FeatureTrack, report: int, statement: Statement, seen: Seen) -> Claimed | None:
         """A verdict on a map feature; a claim when it was measured where that feature cannot be.
 
         Outside the gate the map's feature is not touched: what stands elsewhere is a candidate of its own. Who is right
         is decided when all have been heard (`settle`).
         """
-        track.votes[report] = Vote(said.vehicle, seen.existence, seen.hits)
+        track.votes[report] = Vote(statement.vehicle, seen.existence, seen.hits)
         if seen.position_m is None or seen.cov_m2 is None or len(track.state.points_m) > 1:
             return None
         place = PlaceEstimate.of(seen.position_m[None], seen.cov_m2)
         if fits(place, track.state, self._parameters):
-            track.measure(report, Measured(said.vehicle, place, False, ()), self._parameters)
+            track.measure(report, Measured(statement.vehicle, place, False, ()), self._parameters)
             return None
         apart = place.points_m[0] - track.state.points_m[0]
         if np.hypot(apart[0], apart[1]) <= FEATURE_MOVED_M or seen.existence.exist <= seen.existence.absent:
             return None
-        name = feature_id_of(said.report_id, "elsewhere", track.feature_id)
-        track.votes[report] = Vote(said.vehicle, seen.existence, seen.hits, elsewhere=name)
+        name = feature_id_of(statement.report_id, "elsewhere", track.feature_id)
+        track.votes[report] = Vote(statement.vehicle, seen.existence, seen.hits, elsewhere=name)
         return Claimed(name, track.kind, place, seen.existence, seen.hits, track.attributes, is_found=False)
 
-    def _associate(self, report: int, said: Statement, claims: Sequence[Claimed], judged: set[int]) -> None:
+    def _associate(self, report: int, statement: Statement, claims: Sequence[Claimed], judged: set[int]) -> None:
         """Claims of one kind and shape, one-to-one among the tracks that this report has not judged."""
         kind, is_point = claims[0].kind, len(claims[0].place.points_m) == 1
         # What a report names that has come before the finder's: the track is there under that very id.
@@ -221,20 +221,20 @@ class FeatureTracks:
         witnesses = [track.witnesses for track in open_to]
         named |= {rest[i]: open_to[j] for i, j in pairs(places, states, witnesses, self._parameters)}
         for i, claim in enumerate(claims):
-            self._take(report, said, claim, named.get(i))
+            self._take(report, statement, claim, named.get(i))
 
-    def _take(self, report: int, said: Statement, claim: Claimed, track: FeatureTrack | None) -> None:
-        measured = Measured(said.vehicle, claim.place, claim.is_found, claim.attributes)
+    def _take(self, report: int, statement: Statement, claim: Claimed, track: FeatureTrack | None) -> None:
+        measured = Measured(statement.vehicle, claim.place, claim.is_found, claim.attributes)
         if track is None:
-            if self._begun[said.vehicle] >= FEATURE_MAX_BEGUN:
+            if self._begun[statement.vehicle] >= FEATURE_MAX_BEGUN:
                 return
-            self._begun[said.vehicle] += 1
+            self._begun[statement.vehicle] += 1
             track = self._begin(FeatureTrack(claim.feature_id, claim.kind, claim.place))  # NFL, Eq. (11)
-            track.measured[report], track.repeats[said.vehicle] = measured, 1
+            track.measured[report], track.repeats[statement.vehicle] = measured, 1
         else:
             self._by_id.setdefault(claim.feature_id, [track])
             track.measure(report, measured, self._parameters)
-        track.votes[report] = Vote(said.vehicle, claim.existence, claim.hits)
+        track.votes[report] = Vote(statement.vehicle, claim.existence, claim.hits)
 
     def settle(self) -> None:
         """After the last report: join what turned out to be one, then let those vote against a map feature's place who
@@ -260,7 +260,7 @@ class FeatureTracks:
 
     def _join_all(self) -> None:
         """Join hypotheses that may be one, the likeliest first: inside the gates of each other, not both the map's, and
-        no report has told them apart. Again with what came of it, until nothing changes.
+        no report has distinguished them. Again with what came of it, until nothing changes.
         """
         while couples := [couple for late in self.all if (couple := self._partner(late)) is not None]:
             changed: set[int] = set()
@@ -282,7 +282,7 @@ class FeatureTracks:
         return (float(cost[k]), early[k], late) if np.isfinite(cost[k]) else None
 
     def _join(self, early: FeatureTrack, late: FeatureTrack) -> None:
-        """All that was said of the later hypothesis counts for the earlier, in the order of the reports."""
+        """All evidence of the later hypothesis counts for the earlier, in the order of the reports."""
         self.all.remove(late)
         early.apart |= late.apart
         for track in self.all:
@@ -312,7 +312,7 @@ def _may_be_one(a: FeatureTrack, b: FeatureTrack) -> bool:
 
 
 def joined(early: Remembered | None, late: Remembered | None) -> Remembered | None:
-    """What the closed windows have come to of two hypotheses that turned out to be one."""
+    """The state of two hypotheses that turned out to be one."""
     if early is None or late is None:
         return early or late
     state = step(early.state, late.state)

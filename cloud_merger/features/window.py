@@ -85,7 +85,7 @@ def windows_of(rows: Iterable[ReportRow]) -> dict[int, LayerWindow]:
             reports.setdefault(row.window, []).append(said_of(row.body))
             newest_ns[row.window] = max(row.received_ns, newest_ns.get(row.window, row.received_ns))
     return {
-        window: LayerWindow(tuple(said), day_of(newest_ns[window])) for window, said in sorted(reports.items()) if said
+        window: LayerWindow(tuple(some), day_of(newest_ns[window])) for window, some in sorted(reports.items()) if some
     }
 
 
@@ -97,8 +97,8 @@ def names_of(refuted: Mapping[str, str], rows: Iterable[ReportRow]) -> frozenset
     first: dict[str, str] = {}
     for report in sorted(refuted):
         first.setdefault(refuted[report], report)
-    told = {report for report in refuted if report in read} | set(first.values())
-    return frozenset(f"{report}/{refuted[report]}" for report in told)
+    kept = {report for report in refuted if report in read} | set(first.values())
+    return frozenset(f"{report}/{refuted[report]}" for report in kept)
 
 
 def refuted_of(names: Iterable[str]) -> dict[str, str]:

@@ -1,1 +1,1 @@
-"""The whole cloud as real processes, hurt in every way that a seed draws, and then looked at from outside."""
+"""The whole cloud as real processes under seeded faults, then checked from outside."""

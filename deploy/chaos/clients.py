@@ -107,7 +107,7 @@ def put(outbox: Outbox, sent: SentReport) -> bool:
 
 
 def vehicle(task: ChaosVehicleTask, *, stop: threading.Event) -> None:
-    """Report now and then until told that it is enough, and go on until all is released."""
+    """Send reports until the run ends them, then continue until all are released."""
     street = read_street()
     rng = random.Random(time.time_ns())
     with open_bus(BusConfig(connect=(task.connect,), patient=True), name=task.name) as bus:
@@ -221,7 +221,7 @@ class _Follower:
 
 
 def follower(connect: str, name: str, log: Path, *, stop: threading.Event) -> None:
-    """Follow all tiles, and ask for one after the other, until told to stop."""
+    """Subscribe to all tiles, and request one after the other, until `stop` is set."""
     street, rng = read_street(), random.Random(name)
     notices: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     with open_bus(BusConfig(connect=(connect,), patient=True), name=name) as bus:

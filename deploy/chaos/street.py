@@ -32,7 +32,7 @@ LAYER: Final = "ndt"
 DISTRICTS: Final = 2
 TILES_EAST: Final = 32  # of a district
 SHARES: Final = (1.0, 0.7, 0.4, 0.0)
-"""Of the changes that the drive has found so many are told: others saw more, or less."""
+"""Share of the drive's changes that a report contains: vehicles observe different parts."""
 T0_NS: Final = 1_700_000_000_000_000_000
 EVERY_NS: Final = 20_000_000_000
 
@@ -121,7 +121,7 @@ def _moved(change: TileChange, held: dict[int, Tile]) -> TileChange:
 
 
 def _thinned(change: TileChange, share: float, rows: np.random.Generator) -> TileChange:
-    """A part of the changes; of the others nothing is said but what the track says."""
+    """A part of the changes; the others are left out, and only the track tells about their voxels."""
     chosen = np.flatnonzero(rows.random(len(change.changed)) < share)
     return replace(
         change,

@@ -115,7 +115,7 @@ class Wires:
         self._call(self._lines[name].become("cut"))
 
     def hold(self, name: str) -> None:
-        """Nothing comes through any more, in either direction, and no end is told."""
+        """Hold back all data in both directions, without either end noticing."""
         self._call(self._lines[name].become("held"))
 
     def mend(self, name: str) -> None:

@@ -2,16 +2,15 @@
 
 import dataclasses
 import json
-import signal
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import click
 from rich.console import Console
 
-from gnd.deploy.fleet_cli import run, run_options, summary_text
+from gnd.deploy.fleet_cli import by_part, run, run_options, summary_text
 from gnd.deploy.fleet_config import load_fleet_config
+from gnd.deploy.interruption import end_on_sigterm
 from gnd.deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
 from gnd.deploy.lab.check import as_json as check_as_json
 from gnd.deploy.lab.groups import DEFAULT_GROUPS, parse_groups
@@ -22,6 +21,7 @@ from gnd.deploy.lab.tables import check_table, run_table, run_verdict
 from gnd.deploy.lab.tools import check_rights
 from gnd.deploy.run_folder import create_run_folder, default_run_path
 from gnd.deploy.source import Source
+from gnd.extras import need_all
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.gnd_map.settings import settings_text
 
@@ -32,8 +32,8 @@ WIDTH = 170
 @click.option(
     "--groups", default=DEFAULT_GROUPS, show_default=True, help="Vehicles by link: profile (or TOML file):number, ..."
 )
-@click.option("--name", default="lab", show_default=True, help="Name of the lab: one of a name runs at a time.")
-@click.option("--relay", "relay_all", is_flag=True, help="Delay and lose by a relay even where the kernel has netem.")
+@click.option("--name", default="lab", show_default=True, help="Name of the lab; only one lab of a name can run.")
+@click.option("--relay", "relay_all", is_flag=True, help="A relay process even where the kernel has netem.")
 @run_options
 @click.pass_context
 def lab(
@@ -63,10 +63,12 @@ def lab(
     if context.invoked_subcommand is not None:
         return
     parsed = parse_groups(groups)
-    config = load_fleet_config(config_file, options | {"agents": sum(g.count for g in parsed), "link": groups}, changes)
+    counts = {"agents": sum(group.count for group in parsed), "link": groups}
+    config = load_fleet_config(config_file, by_part(options) | counts, changes)
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return
+    need_all()
     source = Source(drives, base_map, worlds, config.agents)
     check_rights()
     end_on_sigterm()
@@ -87,7 +89,7 @@ def lab(
 @lab.command()
 @click.option("--links", default="3g,4g,5g", show_default=True, help="Profiles or TOML files, with commas.")
 @click.option("--name", default="check", show_default=True, help="Name of the lab.")
-@click.option("--relay", "relay_all", is_flag=True, help="Delay and lose by a relay even where the kernel has netem.")
+@click.option("--relay", "relay_all", is_flag=True, help="A relay process even where the kernel has netem.")
 @click.option("--seconds", type=click.FloatRange(0.5, 60), default=3.0, show_default=True, help="Of each transfer.")
 @click.option("--json", "as_json_", is_flag=True, help="Print the measurements as JSON.")
 def check(links: str, name: str, relay_all: bool, seconds: float, as_json_: bool) -> None:
@@ -113,12 +115,3 @@ def clean() -> None:
         click.echo(f"{name}: {len(removed)} namespaces removed" if removed else f"{name} runs: left alone")
     if not done:
         click.echo("nothing to remove")
-
-
-def end_on_sigterm() -> None:
-    """Make SIGTERM end the command as Ctrl-C does, so that a lab is removed; `gnd fleet` later sets its own."""
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, end)

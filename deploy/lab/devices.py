@@ -14,7 +14,7 @@ HEADER_BYTES: Final = 52
 """IPv4 and TCP with time stamps."""
 MTU_BYTES: Final = SEGMENT_BYTES + HEADER_BYTES
 QUEUE_S: Final = 0.2
-"""What may wait for a link, as time at its rate: an assumption; cellular queues are said to be deep."""
+"""What may wait for a link, as time at its rate: an assumption; cellular queues are deep."""
 MIN_QUEUE_BYTES: Final = 64 * MTU_BYTES
 QUEUE_PACKETS: Final = 4000
 

@@ -181,7 +181,7 @@ class Wire:
 
 
 def run_relay(links: tuple[LabLink, ...], account: Path, *, stop: threading.Event) -> None:
-    """Carry the packets of some links until told to stop; the role of a process.
+    """Carry the packets of some links until `stop` is set; the role of a process.
 
     Args:
         links: their TUN interfaces must exist.

@@ -2,18 +2,17 @@
 
 import logging
 import statistics
-import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.counters import DeviceReader, TcpSample, tcp_samples
-from gnd.deploy.lab.groups import LabLink
 from gnd.deploy.lab.lab import Lab
+from gnd.deploy.repeating import repeated
 
 PERIOD_S: Final = 0.1
 WINDOW_S: Final = 1.0
@@ -69,51 +68,41 @@ class LinkSeen:
         return sum(value[1] for value in values) / sent if sent else None
 
 
-@dataclass(slots=True)
-class Sampler:
-    """The thread that looks; `seen` holds its findings by number of the vehicle."""
+class _Sampler:
+    """Looks at the links of a lab; `seen` has its findings by number of the vehicle."""
 
-    lab: Lab
-    seen: dict[int, LinkSeen]
-    _stop: threading.Event = field(default_factory=threading.Event)
+    def __init__(self, lab: Lab) -> None:
+        self.seen = {link.number: LinkSeen() for link in lab.links}
+        self._cloud_namespace = lab.cloud_namespace
+        self._links = {lab.links[group.first].vehicle_namespace: lab.links_of(group) for group in lab.groups}
+        self._by_address = {link.vehicle_address: ("up", link.number) for link in lab.links}
+        self._by_address |= {link.cloud_address: ("down", link.number) for link in lab.links}
+        self._readers = {namespace: DeviceReader.of(namespace) for namespace in self._links}
 
-    def run(self) -> None:
-        """Look until told to stop."""
-        links = {self.lab.links[group.first].vehicle_namespace: self.lab.links_of(group) for group in self.lab.groups}
-        readers = {namespace: DeviceReader.of(namespace) for namespace in links}
+    def look(self, number: int) -> None:
+        """Read the interfaces, and at every twentieth look TCP."""
+        for namespace, reader in self._readers.items():
+            now_s, counters = time.monotonic(), reader.sent_and_received()
+            for link in self._links[namespace]:
+                self.seen[link.number].counted(now_s, *counters[link.vehicle_device])
+        if number % TCP_EVERY == 0:
+            self._ask_tcp()
+
+    def _ask_tcp(self) -> None:
         try:
-            look = 0
-            while not self._stop.wait(PERIOD_S):
-                for namespace, reader in readers.items():
-                    self._count(links[namespace], reader)
-                if look % TCP_EVERY == 0:
-                    self._ask_tcp(tuple(links))
-                look += 1
-        finally:
-            for reader in readers.values():
-                reader.file.close()
-
-    def _count(self, links: tuple[LabLink, ...], reader: DeviceReader) -> None:
-        now_s, counters = time.monotonic(), reader.sent_and_received()
-        for link in links:
-            self.seen[link.number].counted(now_s, *counters[link.vehicle_device])
-
-    def _ask_tcp(self, namespaces: tuple[str, ...]) -> None:
-        by_address = {link.vehicle_address: ("up", link.number) for link in self.lab.links}
-        by_address |= {link.cloud_address: ("down", link.number) for link in self.lab.links}
-        try:
-            samples = [sample for ns in (*namespaces, self.lab.cloud_namespace) for sample in tcp_samples(ns)]
+            samples = [sample for ns in (*self._links, self._cloud_namespace) for sample in tcp_samples(ns)]
         except LabError as error:  # a look that fails is a look less
             _log.warning("%s", error)
             return
         for sample in samples:
-            place = by_address.get(_host(sample.local))
+            place = self._by_address.get(_host(sample.local))
             if place is not None:
                 self.seen[place[1]].tcp(place[0], sample)
 
-    def stop(self) -> None:
-        """End the looking."""
-        self._stop.set()
+    def close(self) -> None:
+        """Close the interfaces, or their namespaces stay."""
+        for reader in self._readers.values():
+            reader.file.close()
 
 
 def _host(local: str) -> str:
@@ -124,11 +113,6 @@ def _host(local: str) -> str:
 @contextmanager
 def sampling(lab: Lab) -> Iterator[dict[int, LinkSeen]]:
     """Watch the links for the block; gives the findings by number of the vehicle, complete after the block."""
-    sampler = Sampler(lab, {link.number: LinkSeen() for link in lab.links})
-    thread = threading.Thread(target=sampler.run, name="lab-sampler")
-    thread.start()
-    try:
+    sampler = _Sampler(lab)
+    with closing(sampler), repeated(sampler.look, PERIOD_S, "lab-sampler"):
         yield sampler.seen
-    finally:
-        sampler.stop()
-        thread.join()

@@ -27,7 +27,7 @@ from gnd.schemas.report_states import ReportState, ReportStates
 
 POLL_S: Final = 0.05
 LOOK_S: Final = 0.5
-"""How often reports are looked for of which no word has come."""
+"""Period at which reports without an answer are looked for."""
 DONE: Final = ("released", "quarantined")
 _LOG = logging.getLogger(__name__)
 Work = Callable[[Sender], None]
@@ -169,7 +169,7 @@ class _Herd:
             stop.wait(POLL_S)
 
     def close(self) -> None:
-        """End the threads; what they have under way comes to its end."""
+        """End the threads after their current messages."""
         for _ in self._threads:
             self._put(9, None)
         for thread in self._threads:
@@ -210,13 +210,13 @@ class _Herd:
         try:
             states = ReportStates.decode(payload).states
         except SchemaError:
-            _LOG.exception("a notice of what is wanted cannot be read")
+            _LOG.exception("a message with the states of reports cannot be read")
             return
         for state in states:
             self._hear(state)
 
     def _hear(self, state: ReportState) -> None:
-        """What a vehicle does when it hears how far a report has come; the word may overtake the ack."""
+        """Process the state of a report; it may arrive before the acknowledgement."""
         with self._lock:
             one = self._open.get(state.report_id)
             if one is None or state.status in ("waiting", "unknown"):
@@ -235,7 +235,7 @@ class _Herd:
                 self._put(0, lambda sender: sender.whole(one))
 
     def _ask_after(self) -> None:
-        """Ask after acknowledged reports of which no word has come for some time, all of a vehicle at once."""
+        """Ask for the states of acknowledged reports that had no answer for some time, all of a vehicle at once."""
         now_s = time.monotonic()
         silent = defaultdict(list)
         with self._lock:

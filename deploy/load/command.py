@@ -2,38 +2,37 @@
 
 import json
 import math
-import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from gnd.deploy.interruption import ending_in_order
+from gnd.deploy.live import progress_bars
 from gnd.deploy.load.making import kept_runs
 from gnd.deploy.load.plan import LoadOptions
 from gnd.deploy.load.run import Tell, run_load
 from gnd.deploy.load.verdict import summary
+from gnd.extras import need_all
 
 PATH: Final = click.Path(path_type=Path)
 
 
-@click.command(short_help="Replay kept drives as many vehicles and see whether the cloud keeps up.")
+@click.command(short_help="Replay recorded reports as those of many vehicles and see whether the cloud keeps up.")
 @click.option("--vehicles", type=int, default=100, show_default=True, help="How many.")
-@click.option("--km", type=float, default=1.0, show_default=True, help="Way of each.")
+@click.option("--km", type=float, default=1.0, show_default=True, help="Distance that each drives.")
 @click.option(
     "--pace",
     type=click.Choice(["real", "max"]),
     default="real",
     show_default=True,
-    help="Real driving, or as fast as it goes.",
+    help="At the speed of real driving, or as fast as possible.",
 )
 @click.option("--kmh", type=float, default=30.0, show_default=True, help="Speed, for --pace real.")
 @click.option("--seconds", type=float, default=math.inf, help="Send nothing later than this after the start.")
@@ -41,7 +40,7 @@ PATH: Final = click.Path(path_type=Path)
     "--drives", type=PATH, help="A finished run of `gnd fleet`.  [default: runs/load-drives, made where it is missing]"
 )
 @click.option("--settled", type=PATH, help="A run of the same street on its healed map, for --changed-share.")
-@click.option("--seed", type=int, default=1, show_default=True, help="Of starting places and report ids.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Seed of starting places and report ids.")
 @click.option("--per-street", type=int, default=4, show_default=True, help="Vehicles on a street at the same time.")
 @click.option(
     "--changed-share",
@@ -51,36 +50,34 @@ PATH: Final = click.Path(path_type=Path)
     help="Share of streets whose map is older than their changes.",
 )
 @click.option("--shards", type=int, default=2, show_default=True, help="Merger shards.")
-@click.option("--clients", type=int, default=2, show_default=True, help="Processes that are the vehicles.")
-@click.option("--in-flight", type=int, default=50, show_default=True, help="Requests under way, of each client.")
+@click.option("--clients", type=int, default=2, show_default=True, help="Processes, each of many vehicles.")
+@click.option("--in-flight", type=int, default=50, show_default=True, help="Concurrent requests of each client.")
 @click.option(
     "--drain", "drain_s", type=float, default=10.0, show_default=True, help="Seconds after which all must be merged."
 )
-@click.option("--keep", type=PATH, help="Empty folder for store, logs and accounts, to look at afterwards.")
+@click.option("--keep", type=PATH, help="Empty folder in which store, logs and accounts are kept.")
 @click.option(
     "--json", "json_file", type=click.Path(path_type=Path, allow_dash=True), help="Write the figures; `-`: print them."
 )
 def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file: Path | None, **given: Any) -> None:
-    """Send the reports of a few kept drives again, as those of many vehicles on many streets, and measure the cloud.
+    """Replay the reports of a few drives as those of many vehicles on many streets, and measure the cloud.
 
     Router, tile server and merger shards run as processes of their own. Each street is a copy of the kept one at
     another place, with its map and the reports that were made on it.
     """
+    need_all()
     options = LoadOptions(**given)
     if json_file is not None and str(json_file) != "-" and not json_file.absolute().parent.is_dir():
         raise click.BadParameter(f"there is no folder {json_file.absolute().parent}", param_hint="--json")
     console = Console(stderr=True)
-    runs, stop = kept_runs(drives, settled, console), threading.Event()
-    with _ending(stop), _folder(keep) as folder, _bar(console) as tell:
+    runs = kept_runs(drives, settled, console)
+    with ending_in_order() as stop, _folder(keep) as folder, _bar(console) as tell:
         figures = summary(run_load(options, runs, folder, tell, stop))
-    text = json.dumps(figures, indent=2)
-    if json_file is not None and str(json_file) != "-":
-        json_file.write_text(text + "\n", encoding="utf-8")
-    if json_file is not None and str(json_file) == "-":
-        click.echo(text)
-    else:
+    if json_file is not None:
+        with click.open_file(str(json_file), "w", encoding="utf-8") as file:
+            file.write(json.dumps(figures, indent=2) + "\n")
+    if str(json_file) != "-":
         Console(width=110).print(table_of(figures))
-
     if figures["why_not"] == ["the run was interrupted"]:
         sys.exit(130)
 
@@ -125,24 +122,6 @@ def _spread(values: dict[str, float | None], unit: str) -> str:
 
 
 @contextmanager
-def _ending(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the run in order: what was measured until then is told. A second one ends it at once."""
-
-    def end(number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-        signal.signal(number, signal.default_int_handler)
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
 def _folder(keep: Path | None) -> Iterator[Path]:
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
@@ -156,13 +135,7 @@ def _folder(keep: Path | None) -> Iterator[Path]:
 
 @contextmanager
 def _bar(console: Console) -> Iterator[Tell]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    with progress_bars(console) as progress:
         task = progress.add_task("drives", total=1)
 
         def tell(what: str, done: float, total: float) -> None:

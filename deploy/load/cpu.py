@@ -1,12 +1,8 @@
-"""CPU that processes have used, read from /proc."""
+"""CPU that processes have used."""
 
-import os
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Final
+from collections.abc import Mapping
 
-_TICK_S: Final = 1.0 / os.sysconf("SC_CLK_TCK")
-_UTIME, _CUTIME = 11, 13  # fields of /proc/PID/stat behind the name, from 0
+import psutil
 
 
 def cpu_s(pid: int) -> float:
@@ -16,20 +12,16 @@ def cpu_s(pid: int) -> float:
 
 def busy_s() -> float:
     """CPU seconds that all programs of the machine have used since it was started."""
-    line = Path("/proc/stat").read_text(encoding="ascii").partition("\n")[0].split()[1:]
-    user, nice, system, _idle, _iowait, irq, softirq, *_ = map(int, line)
-    return _TICK_S * (user + nice + system + irq + softirq)
+    times = psutil.cpu_times()
+    return float(times.user + times.nice + times.system + times.irq + times.softirq)
 
 
 def children(pid: int) -> list[int]:
     """The processes that a process has started and that run."""
-    found: set[int] = set()
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            found |= {int(word) for word in task.read_text(encoding="ascii").split()}
-        except OSError:  # it has ended meanwhile
-            continue
-    return sorted(found)
+    try:
+        return sorted(child.pid for child in psutil.Process(pid).children())
+    except psutil.NoSuchProcess:
+        return []
 
 
 def by_part(pids: Mapping[str, int]) -> dict[str, float]:
@@ -39,24 +31,17 @@ def by_part(pids: Mapping[str, int]) -> dict[str, float]:
         pids: of the processes by name, as the supervisor knows them.
     """
     shards = [pid for name, pid in pids.items() if name.startswith("merger-")]
-    workers = [child for pid in shards for child in children(pid)]
     return {
-        "router": _sum_s(pid for name, pid in pids.items() if name == "router"),
-        "store": _sum_s(pid for name, pid in pids.items() if name == "store"),
-        "shards": sum(_own_s(pid) for pid in shards),  # a worker that has died is counted here
-        "workers": _sum_s(workers),
+        **{part: sum(cpu_s(pid) for name, pid in pids.items() if name == part) for part in ("router", "store")},
+        "shards": sum(map(_own_s, shards)),  # a worker that has died is counted here
+        "workers": sum(cpu_s(child) for pid in shards for child in children(pid)),
     }
-
-
-def _sum_s(pids: Iterable[int]) -> float:
-    return sum(map(cpu_s, pids))
 
 
 def _own_s(pid: int) -> float:
     """CPU of the process, and of its children that have ended."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
-    except OSError:
+        times = psutil.Process(pid).cpu_times()
+    except psutil.NoSuchProcess:
         return 0.0
-    fields = text.rpartition(")")[2].split()
-    return _TICK_S * sum(map(int, fields[_UTIME : _CUTIME + 2]))
+    return float(times.user + times.system + times.children_user + times.children_system)

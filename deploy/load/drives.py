@@ -14,7 +14,7 @@ from pathlib import Path
 import apsw
 import numpy as np
 
-from gnd.deploy.load.errors import LoadError
+from gnd.deploy.errors import LoadError
 from gnd.deploy.run_folder import RunFolder
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile

@@ -9,10 +9,10 @@ from typing import Final
 
 from rich.console import Console
 
+from gnd.deploy.errors import LoadError
 from gnd.deploy.fleet_cli import run as run_fleet
 from gnd.deploy.fleet_config import FleetConfig
 from gnd.deploy.load.drives import KeptRuns, healed_map
-from gnd.deploy.load.errors import LoadError
 from gnd.deploy.run_folder import RunFolder, create_run_folder
 from gnd.deploy.source import Source
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -57,8 +57,7 @@ def _drive(root: Path, source: Source) -> None:
         headway_s=0.0,
         link="none",
         world_seed=WORLD_SEED,
-        merge_delay_s=MERGE_DELAY_S,
-        merge_after_reports=1000,
+        merger={"store": {"merge_delay_s": MERGE_DELAY_S, "merge_after_reports": 1000}},
     )
     folder = create_run_folder(root, overwrite=True)
     folder.write_mark({"made_by": "gnd load"})

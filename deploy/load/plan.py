@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from gnd.deploy.load.errors import LoadError
+from gnd.deploy.errors import LoadError
 
 Pace = Literal["real", "max"]
 MAX_VEHICLES: Final = 20_000

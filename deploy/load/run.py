@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from gnd.cloud_merger.config import ShardConfig
 from gnd.deploy import roles
 from gnd.deploy.errors import DeployError
 from gnd.deploy.fleet import shard_config
@@ -25,7 +24,7 @@ from gnd.deploy.load.streets import Streets
 from gnd.deploy.load.verdict import LoadOutcome
 from gnd.deploy.ports import claim_port
 from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
-from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.schemas.keys import parse_update_key, update_keys
 from gnd.schemas.updates import TileUpdate
@@ -34,7 +33,7 @@ from gnd.tile_store.sqlite_store import SqliteStore
 LOOK_S: Final = 0.5
 READY_S: Final = 120.0
 LEAD_S: Final = 1.0
-"""Between the word to start and the first report."""
+"""Time between the start signal and the first report."""
 END_S: Final = 30.0
 """Clients that have not ended so long after their time are ended."""
 
@@ -90,7 +89,7 @@ class Running:
         return sum(float(file.read_text(encoding="utf-8")) for file in files)
 
     def wait_until(self, done: Callable[[], bool], until_s: float, each: Callable[[], object]) -> bool:
-        """Look again and again until something holds; False: the time is over, or the run was told to stop."""
+        """Poll until a condition holds; False: the time is over, or `stop` is set."""
         while not done():
             if self.stop.is_set() or time.monotonic() > until_s:
                 return False
@@ -144,31 +143,17 @@ def _cloud(options: LoadOptions, runs: KeptRuns, folder: Path, stop: threading.E
     with ExitStack() as stack:
         supervisor = Supervisor(folder, folder / "pids.json")
         stack.callback(supervisor.stop)
-        specs = _processes(connect, store, shards)
+        specs = roles.of_cloud(connect, connect, store, shards)
         for spec in specs:
             supervisor.start(spec)
         auditor = Auditor(store)
         stack.callback(auditor.close)
         bus = stack.enter_context(open_bus(BusConfig(connect=(connect,), open_timeout_s=READY_S), name="load"))
         running = Running(folder, supervisor, connect, clients, auditor, stop, tuple(spec.name for spec in specs))
-        stack.enter_context(_subscribed(bus, running))
+        stack.enter_context(bus.subscribe(update_keys(LAYER), running.on_update))
         for one in clients:
             supervisor.start(ProcessSpec(_name(one), client, (one,), restart=False))
         yield running
-
-
-@contextmanager
-def _subscribed(bus: Bus, running: Running) -> Iterator[None]:
-    with bus.subscribe(update_keys(LAYER), running.on_update):
-        yield
-
-
-def _processes(connect: str, store: Path, shards: list[ShardConfig]) -> list[ProcessSpec]:
-    return [
-        ProcessSpec("router", roles.router, (connect,)),
-        ProcessSpec("store", roles.store, (store, connect)),
-        *(ProcessSpec(f"merger-{n}", roles.merger, (shard,)) for n, shard in enumerate(shards)),
-    ]
 
 
 def _name(one: ClientConfig) -> str:

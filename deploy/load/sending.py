@@ -63,7 +63,7 @@ class SenderAccount:
 
     @property
     def is_acknowledged(self) -> bool:
-        """Whether the cloud has said that it is durable."""
+        """Whether the cloud has acknowledged it."""
         return self.ack in ("stored", "duplicate")
 
     def as_json(self) -> dict[str, Any]:
@@ -153,7 +153,7 @@ class Sender:
             one.next_ask_s = time.monotonic() + FIRST_ASK_S
 
     def ask(self, vehicle: str, reports: list[Open]) -> tuple[ReportState, ...]:
-        """Ask after reports of a vehicle of which no word has come."""
+        """Ask for the states of a vehicle's reports that had no answer."""
         for one in reports:
             one.account.questions += 1
             wait_s = min(LONGEST_ASK_S, FIRST_ASK_S * 2 ** min(one.account.questions, 8))

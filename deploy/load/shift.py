@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gnd.deploy.load.errors import LoadError
+from gnd.deploy.errors import LoadError
 from gnd.gnd_map.tile import Tile, content_sha
 from gnd.gnd_map.tile_id import LON_TILES, District, TileId
 from gnd.schemas.changes import ChangeReport

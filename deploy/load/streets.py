@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from gnd.deploy.errors import LoadError
 from gnd.deploy.load.drives import KeptRuns, KeptStreet, gaussians_by_sha, read_street
-from gnd.deploy.load.errors import LoadError
 from gnd.deploy.load.plan import LoadOptions, Timetable
 from gnd.deploy.load.shift import DistrictShift, places_of_streets, shifted_tile
 from gnd.gnd_map.gaussian import Gaussians

@@ -1,4 +1,4 @@
-"""What a load came to, and whether the cloud kept up with it."""
+"""The result of a load, and whether the cloud kept up with it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -151,7 +151,7 @@ def _least_items(outcome: LoadOutcome, part: tuple[float, float]) -> int | None:
 
 
 def _lagging(outcome: LoadOutcome) -> Iterable[str]:
-    """How long vehicles wait for word, and tiles for their merge: at the end as at the beginning."""
+    """How long vehicles wait for an answer, and tiles for their merge: the end compared with the beginning."""
     sent = outcome.sent
     n = max(1, len(sent) // 10)
     found = []

@@ -80,7 +80,7 @@ class RoadMotion:
 
     @property
     def lane_times_s(self) -> FloatArray:
-        """Times at which the lane is said, float64 (S,), every STEP_S."""
+        """Times at which the lane is given, float64 (S,), every STEP_S."""
         return self._times
 
     def keep_to(self, lane: IntArray) -> None:

@@ -1,6 +1,7 @@
 """Where the contexts start: probabilities, how much they count, and mixing weights, learnt once and frozen.
 
-`priors.bin` was made by `python -m studies.codec_priors`; its hash is part of what the codecs mean, a test holds it.
+`priors.bin` was made by `python -m studies.codec_priors` at 9b4197d; its hash is part of what the codecs mean, a test
+holds it.
 """
 
 import zlib
@@ -16,6 +17,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import I32, I64
 from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec.voxel_kernels import VOXEL_CONTEXTS, VOXEL_WEIGHTS
 
 _PLAIN: Final = 70
 FLAG_CONTEXTS: Final = k.BLOCK_CONTEXTS + k.CELL_CONTEXTS + k.KIND_CONTEXTS
@@ -26,9 +28,9 @@ NUMBERS_AT: Final = 0  # four plain numbers
 MASK_AT: Final = NUMBERS_AT + 4 * _PLAIN
 FLAGS_AT: Final = MASK_AT + 8 * 4
 VOXELS_AT: Final = FLAGS_AT + FLAG_CONTEXTS
-CONTEXTS: Final = VOXELS_AT + k.VOXEL_CONTEXTS
+CONTEXTS: Final = VOXELS_AT + VOXEL_CONTEXTS
 VOXEL_WEIGHTS_AT: Final = FLAG_WEIGHTS
-WEIGHTS: Final = FLAG_WEIGHTS + k.VOXEL_WEIGHTS
+WEIGHTS: Final = FLAG_WEIGHTS + VOXEL_WEIGHTS
 
 _FIRST_WEIGHT: Final = 24_000
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from gnd.gnd_map.arrays import I32, I64
 from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec import voxel_kernels as v
 from gnd.gnd_map.codec.coding import Coder
 from gnd.gnd_map.codec.lattice import Integers, Lattice, Quantised
 from gnd.gnd_map.codec.priors import FLAGS_AT, VOXEL_WEIGHTS_AT, VOXELS_AT, number_at
@@ -144,64 +145,77 @@ def code_voxels(
 ) -> Quantised:
     """Write the Gaussians of these voxels, or read them (`quantised` None)."""
     n_known = len(known.quantised)
-    table = np.zeros((1 + n_known + len(voxel_id), k.COLUMNS), np.int32)
+    table = np.zeros((1 + n_known + len(voxel_id), v.COLUMNS), np.int32)
     where = np.asarray(box.empty(np.int32, -1), np.int32)
     table[0] = _typical(lattice)
     _fill(table[1 : 1 + n_known], box, known.quantised)
     where[box.places(known.quantised.voxel_id)] = np.arange(1, 1 + n_known)
     places = box.places(voxel_id)
     new = table[1 + n_known :]
-    new[:, k.SELF] = where[places]
-    new[:, k.Z], new[:, k.Y], new[:, k.X] = places
+    new[:, v.SELF] = where[places]
+    new[:, v.Z], new[:, v.Y], new[:, v.X] = places
     where[box.places(known.quantised.voxel_id[known.replaced])] = -2
     where[places] = -2
     if quantised is not None:
         _fill(new, box, quantised, keep_self=True)
-    shape, pitch = _numbers(lattice, box.grid, n_known > 0)
-    sd, refs = np.array(lattice.sd, np.int64), np.zeros(k.MOST_REFS, np.int64)
-    k.code_voxels(coder.state, table, 1 + n_known, where, sd, shape, pitch, VOXELS_AT, VOXEL_WEIGHTS_AT, refs)
+    v.code_voxels(_coding(coder, table, where, lattice, box.grid, has_base=n_known > 0), 1 + n_known)
     coder.check()
     return _read(new, voxel_id)
 
 
 def _fill(rows: I32, box: Box, q: Quantised, *, keep_self: bool = False) -> None:
-    rows[:, k.Z], rows[:, k.Y], rows[:, k.X] = box.places(q.voxel_id)
-    rows[:, k.AXIS], rows[:, k.COUNT] = q.axis, q.count
-    rows[:, k.LEVEL : k.LEVEL + 3], rows[:, k.SLOPE : k.SLOPE + 3], rows[:, k.STEP : k.STEP + 3] = (
+    rows[:, v.Z], rows[:, v.Y], rows[:, v.X] = box.places(q.voxel_id)
+    rows[:, v.AXIS], rows[:, v.COUNT] = q.axis, q.count
+    rows[:, v.LEVEL : v.LEVEL + 3], rows[:, v.SLOPE : v.SLOPE + 3], rows[:, v.STEP : v.STEP + 3] = (
         q.level,
         q.slope,
         q.step,
     )
     if not keep_self:
-        rows[:, k.SELF] = -1
+        rows[:, v.SELF] = -1
 
 
 def _read(rows: I32, voxel_id: I32) -> Quantised:
     columns = (
-        rows[:, k.AXIS],
-        rows[:, k.LEVEL : k.LEVEL + 3],
-        rows[:, k.SLOPE : k.SLOPE + 3],
-        rows[:, k.STEP : k.STEP + 3],
+        rows[:, v.AXIS],
+        rows[:, v.LEVEL : v.LEVEL + 3],
+        rows[:, v.SLOPE : v.SLOPE + 3],
+        rows[:, v.STEP : v.STEP + 3],
     )
     axis, level, slope, step = (np.ascontiguousarray(c) for c in columns)
-    return Quantised(voxel_id, axis, level, slope, step, np.ascontiguousarray(rows[:, k.COUNT]))
+    return Quantised(voxel_id, axis, level, slope, step, np.ascontiguousarray(rows[:, v.COUNT]))
 
 
 def _typical(lattice: Lattice) -> I32:
     """A row of values to expect where no neighbour is known: 1.5 cm thick, 28 cm wide, some hundred points."""
-    row = np.zeros(k.COLUMNS, np.int32)
+    row = np.zeros(v.COLUMNS, np.int32)
     sd_m = np.array(lattice.sd) * 2.0**-20
     wide = int(np.searchsorted(sd_m[:: lattice.plane_step], 0.28))
-    row[k.LEVEL : k.LEVEL + 3] = wide, wide, int(np.searchsorted(sd_m, 0.015))
-    row[k.AXIS], row[k.SELF], row[k.COUNT] = 3, -1, int(np.searchsorted(lattice.counts, 80))
+    row[v.LEVEL : v.LEVEL + 3] = wide, wide, int(np.searchsorted(sd_m, 0.015))
+    row[v.AXIS], row[v.SELF], row[v.COUNT] = 3, -1, int(np.searchsorted(lattice.counts, 80))
     return row
 
 
-def _numbers(lattice: Lattice, grid: VoxelGrid, has_base: bool) -> tuple[I64, I64]:
-    shape = (
-        lattice.plane_step, lattice.slope_bits, lattice.shear_bits, lattice.thin_bits, lattice.plane_bits,
-        lattice.length_bits, lattice.mean_bits, int(has_base),
-    )  # fmt: skip
+def _coding(
+    coder: Coder, table: I32, where: I32, lattice: Lattice, grid: VoxelGrid, *, has_base: bool
+) -> v.VoxelCoding:
     # 1/256 m: coarse enough that no machine's sine rounds it another way
     pitch = [round(size_m * 256) << (lattice.mean_bits - 8) for size_m in (grid.dx_m, grid.dy_m, grid.dz_m)]
-    return np.array(shape, np.int64), np.array(pitch, np.int64)
+    return v.VoxelCoding(
+        coder.state,
+        VOXELS_AT,
+        VOXEL_WEIGHTS_AT,
+        table,
+        where,
+        np.zeros(v.MOST_REFS, np.int64),
+        np.array(lattice.sd, np.int64),
+        np.array(pitch, np.int64),
+        lattice.plane_step,
+        lattice.slope_bits,
+        lattice.shear_bits,
+        lattice.thin_bits,
+        lattice.plane_bits,
+        lattice.length_bits,
+        lattice.mean_bits,
+        int(has_base),
+    )

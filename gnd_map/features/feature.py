@@ -146,10 +146,6 @@ class Feature:
         position: F64 = self.points_m[0]
         return position
 
-    def attribute(self, name: str, default: str = "") -> str:
-        """The value of an attribute."""
-        return dict(self.attributes).get(name, default)
-
 
 def snapped(feature: Feature) -> Feature:
     """The feature on the lattice of what is published; a second time changes nothing.

@@ -16,7 +16,7 @@ from gnd.gnd_map.arrays import F64, I64, check_array
 from gnd.gnd_map.errors import FeatureError
 from gnd.gnd_map.features.feature import CUT_END, CUT_START, Feature
 from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinates
+from gnd.gnd_map.tile_id import LON_TILES, TileId, geodetic_of_tile_coordinates, tile_coordinates
 
 Piece = tuple[TileId, F64, int]
 """Tile, points (N, 3) in its ENU frame, cuts."""
@@ -59,7 +59,10 @@ def cut_polyline(lat_rad: F64, lon_rad: F64, height_m: F64) -> list[Piece]:
         check_array(name, values, np.float64, (len(lat_rad),))
     if not len(lat_rad):
         raise FeatureError("a polyline without vertices has no place")
-    line = np.column_stack([*tile_coordinates(lat_rad, lon_rad), height_m])
+    u, v = tile_coordinates(lat_rad, lon_rad)
+    if (np.abs(np.diff(u)) > LON_TILES / 2).any():  # over 180 degrees the short way round
+        u = np.unwrap(u, period=LON_TILES)
+    line = np.column_stack([u, v, height_m])
     if len(line) == 1:
         return [_piece(line, 0)]
     return [_piece(vertices, cuts) for vertices, cuts in _runs(line)]

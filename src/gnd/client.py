@@ -1,15 +1,14 @@
 """A client of the bus: the tiles of a region as they are, and every new version from now on."""
 
 import logging
-import queue
 import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Final, Self
 
-from gnd.fetching import TileServerClient
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.errors import BusClosed, BusError
@@ -19,9 +18,10 @@ from gnd.gnd_map.region import Region, as_region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError, WrongHash
-from gnd.schemas.keys import update_keys
 from gnd.schemas.tiles import CatalogEntry
-from gnd.schemas.updates import TileUpdate, updated
+from gnd.schemas.updates import updated
+from gnd.tile_client.fetching import TileServerClient
+from gnd.tile_client.following import NewVersion, RegionFollower
 
 if TYPE_CHECKING:
     from gnd.vehicle_agent.report.sink import OutgoingReport
@@ -187,28 +187,26 @@ class UpdateStream:
 
     A notice is worked on when the next update is asked for: its delta is applied to the tile that is held, or the new
     tile is fetched where none is held or the delta does not fit. Of several versions that were published meanwhile the
-    newest alone may be given. What a lost notice told is found by the catalog, every ten seconds.
+    newest alone may be given. A version whose notice was lost is found in the catalog, which is compared every ten
+    seconds.
     """
 
     def __init__(self, bus: Bus, asking: dict[str, TileServerClient], region: Region, *, existing: bool) -> None:
-        self._bus, self._asking, self._region = bus, asking, region
-        self._notices: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._bus, self._asking = bus, asking
         self._ready: deque[MapUpdate] = deque()
-        self._versions: dict[tuple[str, TileId], int] = {}
         self._held: OrderedDict[tuple[str, TileId], AnyTile] = OrderedDict()
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
-        # first listen, then look what is there: nothing falls between
-        self._subscriptions = [
-            bus.subscribe(update_keys(layer, region.prefix), lambda _key, notice: self._notices.put(notice))
-            for layer in asking
-        ]
+        # first listen, then ask for the catalog: no version falls between
+        self._follower = RegionFollower(bus, asking, region, COMPARED_EVERY_S)
         try:
-            self._begin(existing)
+            catalogs = self._follower.begin()
+            for layer, entries in catalogs.items() if existing else ():
+                for tile in asking[layer].fetch([entry.tile for entry in entries]):
+                    self._give(layer, tile, "existing")
         except BaseException:
             self.close()
             raise
-        self._compared_s = time.monotonic()
 
     def __enter__(self) -> Self:
         return self
@@ -238,7 +236,8 @@ class UpdateStream:
                 return self._ready.popleft()
             left_s = _POLL_S if deadline_s is None else min(_POLL_S, deadline_s - time.monotonic())
             try:
-                self._work(max(left_s, 0.0))
+                for layer, versions in groupby(self._follower.next(max(left_s, 0.0)), key=lambda one: one.layer):
+                    self._take(layer, list(versions))
             except BusClosed:
                 break
             except (BusError, SchemaError) as error:  # asked for again when the catalog is compared
@@ -267,60 +266,39 @@ class UpdateStream:
     def close(self) -> None:
         """End it. May be called again, and from the callback."""
         self._closed.set()
-        for subscription in self._subscriptions:
-            subscription.close()
+        self._follower.close()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
 
-    def _begin(self, existing: bool) -> None:
-        """Learn where the region stands."""
-        for layer, asking in self._asking.items():
-            entries = asking.catalog(self._region)
-            self._versions |= {(layer, entry.tile): entry.version for entry in entries}
-            for tile in asking.fetch([entry.tile for entry in entries]) if existing else ():
-                self._give(layer, tile, "existing")
-
-    def _work(self, wait_s: float) -> None:
-        """Work on one notice, or on the catalogs when it is time."""
-        if time.monotonic() - self._compared_s >= COMPARED_EVERY_S:
-            self._compared_s = time.monotonic()
-            self._compare()
+    def _take(self, layer: str, versions: Sequence[NewVersion]) -> None:
+        """Give the newer ones among some versions of one layer: one by a notice, or all whose notices were lost."""
+        known = self._follower.known
+        newer = [one for one in versions if one.version > known.get((layer, one.tile), 0)]
+        to_fetch = [one.tile for one in newer if not self._has_applied(one)]
+        if not to_fetch:
             return
+        notice = versions[0].notice
+        held = {tile: self._held[layer, tile] for tile in to_fetch if (layer, tile) in self._held}
+        for tile in self._asking[layer].fetch(to_fetch, held):
+            if tile.version > known.get((layer, tile.tile_id), 0):
+                self._give(layer, tile, "missed" if notice is None else notice.update.reason)
+
+    def _has_applied(self, version: NewVersion) -> bool:
+        """Give a version by the delta of its notice, where that fits the tile that is held."""
+        held = self._held.get((version.layer, version.tile))
+        if version.notice is None or held is None or not version.notice.update.follows(held.sha):
+            return False
         try:
-            notice = self._notices.get(timeout=wait_s)
-        except queue.Empty:
-            return
-        update = TileUpdate.decode(notice)
-        if update.tile in self._region and update.version > self._versions.get((update.layer, update.tile), 0):
-            self._take(update)
-
-    def _take(self, update: TileUpdate) -> None:
-        held = self._held.get((update.layer, update.tile))
-        if held is not None and held.sha == update.previous_sha and update.has_delta:
-            try:
-                self._give(update.layer, updated(update, held), update.reason)
-                return
-            except WrongHash as error:
-                _log.info("%s", error)
-        self._fetch(update.layer, [update.tile], update.reason)
-
-    def _compare(self) -> None:
-        """Find the versions whose notices never came."""
-        for layer, asking in self._asking.items():
-            entries = asking.catalog(self._region)
-            newer = [e.tile for e in entries if e.version > self._versions.get((layer, e.tile), 0)]
-            self._fetch(layer, newer, "missed")
-
-    def _fetch(self, layer: str, tiles: Sequence[TileId], reason: str) -> None:
-        held = {tile: self._held[layer, tile] for tile in tiles if (layer, tile) in self._held}
-        for tile in self._asking[layer].fetch(tiles, held):
-            if tile.version > self._versions.get((layer, tile.tile_id), 0):
-                self._give(layer, tile, reason)
+            self._give(version.layer, updated(version.notice.update, held), version.notice.update.reason)
+        except WrongHash as error:
+            _log.info("%s", error)
+            return False
+        return True
 
     def _give(self, layer: str, tile: AnyTile, reason: str) -> None:
         key = layer, tile.tile_id
         self._ready.append(MapUpdate(layer, tile, self._held.get(key), reason))
-        self._versions[key] = tile.version
+        self._follower.known[key] = tile.version
         self._held[key] = tile
         self._held.move_to_end(key)
         if len(self._held) > MOST_HELD:

@@ -1,5 +1,6 @@
 """What `pip install gnd-fleet` leaves out, and which extra brings it."""
 
+import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
@@ -30,6 +31,24 @@ def missing_extra(error: ModuleNotFoundError) -> MissingExtra | None:
     packages = [".".join(name.split(".")[:2]) for name in _modules(error.__traceback__)]
     extra = next((EXTRA_OF[package] for package in reversed(packages) if package in EXTRA_OF), "all")
     return MissingExtra(f"{module} is not installed; it comes with: pip install 'gnd-fleet[{extra}]'")
+
+
+def need_all() -> None:
+    """For commands that run every part of the system: refuse to begin where one is not installed.
+
+    Raises:
+        MissingExtra: with the modules that are missing.
+    """
+    missing = sorted(name for name in LEFT_OUT if not _is_there(name))
+    if missing:
+        raise MissingExtra(f"{', '.join(missing)}: not installed; this command needs: pip install 'gnd-fleet[all]'")
+
+
+def _is_there(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import importlib
 from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,24 +13,30 @@ import numpy.typing as npt
 
 from gnd.client import Client
 from gnd.extras import explained
+from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.map_reader import Map
 from gnd.schemas.drive import Deskew, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from gnd.schemas.tiles import as_kind
+from gnd.tile_store.store import Store
 from gnd.tile_store.values import DEFAULT_LAYER
 
 if TYPE_CHECKING:
     from gnd.vehicle_agent.config import PipelineParameters
     from gnd.vehicle_agent.pipeline import Output, Pipeline
-    from gnd.vehicle_agent.tiles_at_hand import TilesAtHand, TileSource
+    from gnd.vehicle_agent.place import Place
+    from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 
 WAITED_NS: Final = 10_000_000_000
 """Before the first position, measurements of the last so many nanoseconds are kept, ..."""
 MOST_WAITING: Final = 20_000
 """... at most so many."""
+Fetch = Callable[[str, Sequence[TileId]], Iterator[AnyTile]]
+"""The newest tiles of a layer, those of the given ids that there are."""
 _ANYWHERE: Final = LocalFrame(0.0, 0.0)
 
 
@@ -45,7 +52,8 @@ class Vehicle:
     work is done in `push`, in the caller's thread.
 
     Args:
-        map: the map, or its file; or a client of the bus, from which tiles are fetched as they are needed.
+        map: the map, or its file; or a client of the bus, from which tiles are fetched as they are needed, those of a
+            district with one question.
         mount: (4, 4) T_vehicle_lidar: p_vehicle = T_vehicle_lidar @ p_lidar, x forward, z up, m.
         name: pseudonym of the vehicle, in its reports. [1-64 of A-Z a-z 0-9 . _ -]
         sensor_model: such as "VLP-16".
@@ -54,7 +62,7 @@ class Vehicle:
         sweep_ns: how long a sweep lasts, ns; 0 = not told.
         reports: False: it only localises.
         layer: a layer of Gaussians.
-        parameters: of the algorithms.
+        parameters: of the algorithms; with feature layers the map's features are fetched as well.
 
     Raises:
         BadValue: a mount that is no rigid transform, or a name that is none.
@@ -86,7 +94,7 @@ class Vehicle:
         self._waiting: deque[DriveItem] = deque(maxlen=MOST_WAITING)
         self._pipeline: Pipeline[TilesAtHand] | None = None
         self._open = ExitStack()
-        self._source = self._source_of(map)
+        self._fetch = self._fetch_of(map)
 
     @classmethod
     def of_drive(
@@ -186,20 +194,19 @@ class Vehicle:
         """The drive has ended: what waits is judged, decided and reported."""
         return self.pipeline.finish()
 
-    def _source_of(self, map_given: Map | Client | str | Path) -> "TileSource":
-        from gnd.vehicle_agent.localise_drive.tiles import StoreMap
-
+    def _fetch_of(self, map_given: Map | Client | str | Path) -> Fetch:
         if isinstance(map_given, Client):
-            return _TilesOfClient(map_given, self._layer)
+            return lambda layer, tiles: map_given.fetch(tiles, layer=layer)
         opened = map_given if isinstance(map_given, Map) else self._open.enter_context(Map(map_given))
-        return StoreMap(opened.store, self._layer)
+        return lambda layer, tiles: _stored(opened.store, layer, tiles)
 
     def _begin(self, fix: GnssFix) -> "Pipeline[TilesAtHand]":
         from gnd.vehicle_agent.pipeline import Pipeline
         from gnd.vehicle_agent.report.reporter import Identity
         from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 
-        header, source = self._header, self._source
+        header, source = self._header, TilesOfMap(self._fetch, self._layer)
+        features = () if self._parameters is None else self._parameters.features.layers
         drive_id = self._drive_id or f"{header.vehicle[:40]}-{fix.t_ns}"
         identity = Identity(header.vehicle, drive_id, header.sensor_model, self._layer) if self._reports else None
         return Pipeline(
@@ -209,19 +216,47 @@ class Vehicle:
             self._parameters,
             identity=identity,
             outbox=_Passed(),
+            feature_tiles=FeatureTilesOfMap(self._fetch, [layer.name for layer in features]),
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _TilesOfClient:
-    """A `TileSource` over the bus: one question a tile."""
+def _stored(store: Store, layer: str, tiles: Sequence[TileId]) -> Iterator[AnyTile]:
+    found = (store.get(layer, tile_id) for tile_id in tiles)
+    return (stored.decode() for stored in found if stored is not None)
 
-    client: Client
+
+@dataclass(frozen=True, slots=True)
+class TilesOfMap:
+    """A layer of Gaussians as the `DistantTileSource` of a drive."""
+
+    fetch: Fetch
     layer: str
 
     def tile(self, tile_id: TileId) -> Tile | None:
-        found = next(self.client.fetch([tile_id], layer=self.layer), None)
-        return None if found is None else as_kind(found, Tile)
+        """The tile of that id, or None where the map has none."""
+        return self.tiles_of([tile_id]).get(tile_id)
+
+    def tiles_of(self, wanted: Sequence[TileId]) -> dict[TileId, Tile]:
+        """Those of the wanted tiles that the map has."""
+        return {tile.tile_id: as_kind(tile, Tile) for tile in self.fetch(self.layer, wanted)}
+
+
+class FeatureTilesOfMap:
+    """The features of the map along a drive: those around and ahead are fetched after some way, each tile once."""
+
+    def __init__(self, fetch: Fetch, layers: Sequence[str]) -> None:
+        from gnd.vehicle_agent.link.feature_tiles_on_the_bus import FeatureTilesAhead
+
+        self._fetch, self._layers, self._ahead = fetch, tuple(layers), FeatureTilesAhead()
+        self._known: set[TileId] = set()
+
+    def follow(self, place: "Place") -> Iterator[tuple[str, FeatureTile]]:
+        """The tiles that were not given yet, with the names of their layers."""
+        new = sorted(set(self._ahead.of(place)) - self._known)
+        self._known.update(new)
+        for layer in self._layers if new else ():
+            for tile in self._fetch(layer, new):
+                yield layer, as_kind(tile, FeatureTile)
 
 
 class _Passed:

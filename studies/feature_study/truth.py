@@ -1,4 +1,4 @@
-"""What estimated features are held against: pairs with true ones, honesty of covariances; where a drive begins."""
+"""What estimated features are held against: pairs with true ones, honesty of covariances."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -7,9 +7,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
-from gnd.fleet_sim.roads.drive import RoadDrive
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, FilterStart, first_pose_of
 
 RADIUS_M: Final = 5.0
 """An estimate farther than this from every free true feature is false, and the true feature missed."""
@@ -91,17 +89,3 @@ class Honesty:
             "within_95": self.within,
             "features": self.features,
         }
-
-
-def start_of(drive: RoadDrive, after_s: float = AFTER_S) -> FilterStart:
-    """Return the pose some seconds after the start, of nothing but wheel speed, yaw rate and GNSS until then.
-
-    Raises:
-        BadPose: too little was driven or too few fixes came to tell a heading.
-    """
-    motion, gnss = drive.motion, drive.gnss
-    end_ns = int(motion.t_ns[0]) + round(after_s * 1e9)
-    n, k = int(np.searchsorted(motion.t_ns, end_ns, "right")), int(np.searchsorted(gnss.t_ns, end_ns, "right"))
-    return first_pose_of(
-        motion.t_ns[:n], motion.speed_mps[:n], motion.yaw_rate_radps[:n], gnss.t_ns[:k], gnss.xy_m[:k], gnss.sigma_m
-    )

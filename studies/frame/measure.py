@@ -3,12 +3,9 @@
 import json
 import platform
 import statistics
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from time import perf_counter, process_time
-from typing import Any
+from time import process_time
 
 from studies.frame.tables import Sheet, print_sheets
 
@@ -41,19 +38,9 @@ def times_s(work: Callable[[], object], runs: int, clock: Callable[[], float] = 
     return found
 
 
-def median_s(work: Callable[[], object], runs: int = 5) -> float:
-    """Return the median wall time, s, of a call."""
-    return statistics.median(times_s(work, runs, perf_counter))
-
-
 def core_s(work: Callable[[], object], runs: int = 15) -> float:
     """Return the median time of the processor, s, of a call."""
     return statistics.median(times_s(work, runs))
-
-
-def least_s(work: Callable[[], object], runs: int = 3) -> float:
-    """Return the least time of the processor, s, of a call."""
-    return min(times_s(work, runs))
 
 
 def spent_s(work: Callable[[], object]) -> float:
@@ -78,41 +65,3 @@ def print_figures(title: str, command: str, figures: Sequence[Figure], *, as_jso
     for one in figures:
         table.add(one.name, f"{one.value:,.3g}" if one.value < 1000 else f"{one.value:,.0f}", one.unit, one.detail)
     print_sheets([table])
-
-
-class Stopwatch:
-    """Sums the processor's time by name, where functions and methods are timed while it is worn.
-
-    A call within a call that is timed counts for the inner one only.
-    """
-
-    def __init__(self) -> None:
-        self.total_s: dict[str, float] = defaultdict(float)
-        self._inner_s = [0.0]
-
-    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """`function`, whose time is summed under `name`."""
-
-        def measured(*args: Any, **kwargs: Any) -> Any:
-            begin_s = process_time()
-            self._inner_s.append(0.0)
-            try:
-                return function(*args, **kwargs)
-            finally:
-                spent_s = process_time() - begin_s
-                self.total_s[name] += spent_s - self._inner_s.pop()
-                self._inner_s[-1] += spent_s
-
-        return measured
-
-    @contextmanager
-    def worn(self, parts: Sequence[tuple[str, Any, str]]) -> Iterator[None]:
-        """Time the attributes (name, owner, attribute) while this lasts."""
-        before = [(owner, attribute, getattr(owner, attribute)) for _, owner, attribute in parts]
-        for (name, owner, attribute), (_, _, function) in zip(parts, before, strict=True):
-            setattr(owner, attribute, self.timed(name, function))
-        try:
-            yield
-        finally:
-            for owner, attribute, function in before:
-                setattr(owner, attribute, function)

@@ -30,10 +30,10 @@ Errors = Callable[[np.random.Generator], Faults]
 
 @dataclass(frozen=True, slots=True)
 class Kidnap:
-    """A start that is trusted and wrong: the vehicle was moved since it was told its pose.
+    """A start that is trusted and wrong: the vehicle was moved since it got its pose.
 
     Attributes:
-        nearest_m, farthest_m: how far off the told pose is.
+        nearest_m, farthest_m: how far off the given pose is.
     """
 
     nearest_m: float

@@ -70,7 +70,7 @@ def _claimed(estimate: PoseEstimate) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """What the localiser says of the time between its clocks [s]: samples stamped so much too late, and one sigma."""
+    """The localiser's estimate of the time between its clocks [s]: samples stamped so much too late; one sigma."""
 
     offset_s: float
     sigma_s: float
@@ -107,7 +107,7 @@ def run_case(
         items: in time order, with reference poses, which the vehicle never sees.
         base: the map.
         parameters: of the localiser.
-        kidnap: a wrong pose that it is told at the first scan, None for none.
+        kidnap: a wrong pose that it gets at the first scan, None for none.
         seed: of where that pose is.
 
     Raises:

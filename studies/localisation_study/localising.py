@@ -1,7 +1,8 @@
 """One run of the localiser over a recorded drive, the map's tiles held around the vehicle as the agent does."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -14,8 +15,13 @@ from gnd.vehicle_agent.pipeline import Pipeline
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 from studies.localisation_study.series import PoseSeries
-from studies.localisation_study.variants import Variant
 from studies.simulation.base_map import BaseMap
+
+WITHOUT: Final = "without_submap"
+OUTDATED: Final = "outdated"
+UPDATED: Final = "updated"
+FRESH: Final = "fresh"
+"""Runs: on the outdated map without and with submaps, and on the two newer maps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +79,6 @@ def localise(
     items: Iterable[DriveItem],
     base: BaseMap,
     parameters: LocaliserParameters,
-    variant: Variant,
 ) -> LocalisedVariant:
     """Run the localiser over a drive.
 
@@ -82,28 +87,21 @@ def localise(
         items: in time order, with reference poses, which the vehicle never sees.
         base: the map that it drives on.
         parameters: of the localiser.
-        variant: what is done to the measurements.
 
     Raises:
         VehicleError: the drive has no GNSS fix.
     """
     fix, all_items = first_fix(items, header.drive_id)
-    vehicle = LocalisingVehicle(variant.header(header), fix, base, parameters)
+    vehicle = LocalisingVehicle(header, fix, base, parameters)
     reference: list[ReferencePose] = []
-    for item in _changed(all_items, variant, vehicle):
+    for item in all_items:
+        vehicle.scans += isinstance(item, Scan)
         if isinstance(item, ReferencePose):
             reference.append(item)
         else:
             vehicle.push(item)
     final, true = vehicle.finish(), vehicle.reference(reference)
     return LocalisedVariant(PoseSeries.of(final, true), PoseSeries.of(vehicle.online, true), vehicle.scans)
-
-
-def _changed(items: Iterable[DriveItem], variant: Variant, vehicle: LocalisingVehicle) -> Iterator[DriveItem]:
-    for item in items:
-        vehicle.scans += isinstance(item, Scan)
-        variant.posed = bool(vehicle.online)
-        yield from variant.items(item)
 
 
 def without_submaps(parameters: LocaliserParameters) -> LocaliserParameters:

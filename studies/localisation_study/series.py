@@ -80,7 +80,7 @@ class PoseSeries:
     Attributes:
         t_ns: int64 (N,).
         error: float64 (N, 3), signed: along and across the true heading [m], heading [deg].
-        health: uint8 (N,), what the vehicle said of the pose, index of `HEALTHS`.
+        health: uint8 (N,), the health that the vehicle gave the pose, index of `HEALTHS`.
     """
 
     t_ns: I64

@@ -20,12 +20,19 @@ from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from studies.frame.command import Bench, StudyReport, study
-from studies.frame.errors import OptionError
 from studies.frame.folder import StudyFolder
 from studies.frame.kept import LOCALISER, SIMULATOR, Kept, key_of, sources_sha
 from studies.frame.options import check, option, parts, seeds
 from studies.frame.pool import Job, Tick
-from studies.localisation_study.localising import LocalisedVariant, localise, without_submaps
+from studies.localisation_study.localising import (
+    FRESH,
+    OUTDATED,
+    UPDATED,
+    WITHOUT,
+    LocalisedVariant,
+    localise,
+    without_submaps,
+)
 from studies.localisation_study.summary import (
     LocalisationOutcome,
     LocalisationSeed,
@@ -34,7 +41,6 @@ from studies.localisation_study.summary import (
     summary_of,
 )
 from studies.localisation_study.trials import StartTrial, begin_times, run_trial
-from studies.localisation_study.variants import FRESH, OUTDATED, UPDATED, VARIANTS, WITHOUT, variant_of
 from studies.simulation.base_map import BaseMap, driven, read_base, surveyed, write_base
 from studies.simulation.cloud import merged_map
 from studies.simulation.options import (
@@ -62,7 +68,7 @@ _MAPS: Final = (*SIMULATOR, "studies/simulation/base_map.py")
 _RUNS: Final = (
     *LOCALISER,
     *(f"studies/simulation/{name}.py" for name in ("poses", "streams")),
-    *(f"studies/localisation_study/{name}.py" for name in ("localising", "variants", "series", "trials", "study")),
+    *(f"studies/localisation_study/{name}.py" for name in ("localising", "series", "trials", "study")),
 )
 _CLOUD: Final = (*VEHICLE, "cloud_merger", "studies/simulation/cloud.py")
 
@@ -82,12 +88,6 @@ class StudyOptions:
         PoseSource("estimated", 0.0, 0.0), "The fleet's: estimated, true, noisy:<m>:<deg>.", read=PoseSource.parse
     )
     trials: int = option(20, "Starts without a pose, for each sensor.", span=(0, None))
-    variant_sensors: tuple[str, ...] | None = option(
-        None,
-        "Sensors that also run with added errors, none for none.  [default: the first]",
-        "--variants",
-        read=lambda text: () if text == "none" else tuple(text.split(",")),
-    )
     parking: float = option(0.2, PARKING, span=(0, 1))
     base: Base = option("driven", "How the maps are made.")
     scans: int | None = option(None, "At most so many scans a drive, for a quick look.", span=(1, None))
@@ -95,14 +95,6 @@ class StudyOptions:
 
     def __post_init__(self) -> None:
         check(self)
-        for sensor in self.variants_of:
-            if sensor not in self.sensors:
-                raise OptionError(f"--variants: {sensor!r} does not drive; driving are {', '.join(self.sensors)}")
-
-    @property
-    def variants_of(self) -> tuple[str, ...]:
-        """The sensors that also run with added errors."""
-        return self.sensors[:1] if self.variant_sensors is None else self.variant_sensors
 
     def of_fleet(self, seed: int) -> RunOptions:
         """Return the run that maps the world of a seed and updates the map."""
@@ -122,7 +114,7 @@ class StudyOptions:
 
 @study(StudyOptions, out="runs/reproduce-localisation", keeps_drives=True)
 def localisation(options: StudyOptions, bench: Bench) -> StudyReport:
-    """Localisation in a changed world: with and without submaps, before and after the map update, with added errors.
+    """Localisation in a changed world: with and without submaps and before and after the map update.
 
     Errors stand beside the GND paper's and Ford's limits. A second start with the same options and folder continues
     where the first ended.
@@ -140,10 +132,9 @@ def localisation(options: StudyOptions, bench: Bench) -> StudyReport:
     found = summary_of(outcome)
 
     def draw(folder: Path) -> None:
-        from studies.localisation_study.figures import draw_figures, draw_overview
+        from studies.localisation_study.figures import draw_figures
 
         draw_figures(outcome, folder)
-        draw_overview(found, folder / "overview.png")
 
     return StudyReport(found, sheets_of(found), draw)
 
@@ -180,7 +171,7 @@ class LocalisationRun:
     """One run of the localiser.
 
     Attributes:
-        name: `WITHOUT` submaps, on the map `OUTDATED`, `UPDATED` or `FRESH`, or one of `VARIANTS`.
+        name: `WITHOUT` submaps, or on the map `OUTDATED`, `UPDATED` or `FRESH`.
         base: file of the map.
         kept: a `RunResult`.
     """
@@ -264,9 +255,8 @@ def _sensor_plan(
     drive, home = drive_config(options, seed, sensor), files.home / "runs"
     drive_key = key_of(world=world, drive=to_mapping(drive), sources=sources_sha(SIMULATOR))
     decides = {"drive": drive_key, "localise": to_mapping(options.method.localise), "sources": sources_sha(_RUNS)}
-    variants = tuple(VARIANTS) if sensor in options.variants_of else ()
     runs = []
-    for name in (WITHOUT, OUTDATED, UPDATED, FRESH, *variants):
+    for name in (WITHOUT, OUTDATED, UPDATED, FRESH):
         path, map_key = maps.get(name, maps[OUTDATED])
         runs.append(
             LocalisationRun(name, path, Kept(home, f"{sensor}-{name}", key_of(map=map_key, name=name, **decides)))
@@ -305,7 +295,7 @@ def _first_runs(options: StudyOptions, plans: list[SeedPlan]) -> list[Job]:
             if one.trials is not None and not one.trials.done:
                 what = (one.recording, plan.files.base, options.trials, options.method.localise, plan.seed, one.trials)
                 jobs.append(Job(f"{one.sensor}, world {plan.seed}: starts", run_trials, what, ticks=True))
-            for names in ((WITHOUT, OUTDATED), (FRESH,), tuple(VARIANTS)):  # which read the recording together
+            for names in ((WITHOUT, OUTDATED), (FRESH,)):  # which read the recording together
                 jobs += _run_job(options, plan, one, names)
     return jobs
 
@@ -326,7 +316,7 @@ def _run_job(options: StudyOptions, plan: SeedPlan, one: SensorPlan, names: tupl
     """The runs of these names, if one is missing."""
     runs = [run for run in one.runs if run.name in names and not run.kept.done]
     name = f"{one.sensor}, world {plan.seed}: {', '.join(run.name for run in runs)}"
-    return [Job(name, run_all, (one.recording, runs, options.method.localise, plan.seed), ticks=True)] if runs else []
+    return [Job(name, run_all, (one.recording, runs, options.method.localise), ticks=True)] if runs else []
 
 
 def record(options: StudyOptions, seed: int, drive: DriveConfig, path: Path, tick: Tick) -> None:
@@ -352,9 +342,7 @@ def make_updated(base: Path, fleet: list[VehicleFile], merge: MergeParameters, k
     write_base(BaseMap({tile: tiles[tile] for tile in sorted(tiles) if len(tiles[tile])}), kept.path)
 
 
-def run_all(
-    recording: Path, runs: list[LocalisationRun], parameters: LocaliserParameters, seed: int, tick: Tick
-) -> None:
+def run_all(recording: Path, runs: list[LocalisationRun], parameters: LocaliserParameters, tick: Tick) -> None:
     """Run the localiser over a recorded drive, once for each run."""
     header, items = read_header(recording), list(read_drive(recording))
     scans = sum(isinstance(item, Scan) for item in items)
@@ -365,8 +353,7 @@ def run_all(
 
         begun_s = process_time()
         of_run = without_submaps(parameters) if run.name == WITHOUT else parameters
-        variant = variant_of(run.name if run.name in VARIANTS else "", seed)
-        found = localise(header, ticking(items, tick_all, scans), read_base(run.base), of_run, variant)
+        found = localise(header, ticking(items, tick_all, scans), read_base(run.base), of_run)
         run.kept.write(RunResult(found, process_time() - begun_s))
 
 

@@ -14,7 +14,7 @@ from gnd.fleet_sim.world_summary import summary
 from gnd.gnd_map.config import to_mapping
 from studies.frame.averages import rounded, worst_of
 from studies.frame.tables import Sheet, sheet
-from studies.localisation_study.localising import LocalisedVariant
+from studies.localisation_study.localising import FRESH, OUTDATED, UPDATED, WITHOUT, LocalisedVariant
 from studies.localisation_study.series import (
     AIM_REINITIALISED,
     AIM_TURNING,
@@ -32,7 +32,6 @@ from studies.localisation_study.series import (
     ErrorLimit,
 )  # fmt: skip
 from studies.localisation_study.trials import WITHIN_S, StartTrial, trials_row
-from studies.localisation_study.variants import FRESH, LABELS, OUTDATED, UPDATED, VARIANTS, WITHOUT
 from studies.simulation.base_map import read_base
 
 
@@ -113,9 +112,6 @@ def _sensor(outcome: SensorOutcome) -> dict[str, Any]:
         row: getattr(runs[name], which).row(runs[name].scans) for row, (name, which) in ROWS.items()
     }
     found["update_ratio"] = update_ratio(found)
-    variants = {name: runs[name].final.row(runs[name].scans) for name in VARIANTS if name in runs}
-    if variants:
-        found["variants"] = variants
     if outcome.trials:
         found["reinitialisation"] = trials_row(outcome.trials)
     found["cpu_s"] = outcome.cpu_s
@@ -241,8 +237,6 @@ def _sheet(sensor: str, rows: Mapping[str, Any]) -> Sheet:
             number, _, what = paper.partition("_")
             theirs = f"paper, {number.replace('table', 'Table ')}, {what.replace('_', ' ')}"
             table.add(*_cells(theirs, PAPER[paper].plain()), style="dim")
-    for name, row in rows.get("variants", {}).items():
-        table.add(*_cells(LABELS[name], row))
     table.notes += [line for line in (update_line(rows), starts_line(rows)) if line]
     return table
 

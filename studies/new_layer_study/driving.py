@@ -1,5 +1,7 @@
 """One drive along a route of the new layer study, mapped without and with the lanes of the HD map; localisation."""
 
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,23 +11,24 @@ from gnd.cloud_merger.features import merge_layer
 from gnd.fleet_sim.drives import EPOCH_NS
 from gnd.fleet_sim.roads.drive import RoadDrive, RoadDriveOptions, drive_route
 from gnd.fleet_sim.roads.looks import DetectorNoise
+from gnd.fleet_sim.roads.recording import items_of
 from gnd.fleet_sim.roads.route import Route
 from gnd.fleet_sim.roads.streetlights import streetlight_motorway
 from gnd.fleet_sim.roads.test_track import test_track
 from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import Feature, FeatureTile, feature_id_of, pieces_of, prior
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import Detections, DriveItem, GnssFix
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureReport
-from gnd.vehicle_agent.features.layer import of_counts
-from gnd.vehicle_agent.features.look import MapFeatures
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes
-from gnd.vehicle_agent.features.mapping.new_layer import NewLayer, lane_map, localise_with_features, map_new_layer
-from gnd.vehicle_agent.features.view import SensorView
-from studies.feature_study.reporting import (
-    BaseLayer,
-    Discovered,
-    coverage_along,
-    in_route_frame,
-    reports_of,
-)
+from gnd.vehicle_agent.config import PipelineParameters
+from gnd.vehicle_agent.features.layer import pose_of
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.features.mapping.graph_pipeline import GraphPipeline
+from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
+from gnd.vehicle_agent.report.reporter import Identity
+from gnd.vehicle_agent.sources.recording import first_fix
+from studies.feature_study.pipelines import TilesAtOnce, found_in, in_route_frame, joined, reports_of
 from studies.new_layer_study.layers import DriveLayers, Layer, LayerLocalised, LayerTruth
 
 TRACK: Final = "track"
@@ -35,6 +38,7 @@ CONFIDENCE: Final = 0.9
 """λ of a detector that misses one in ten."""
 _HOUR_NS: Final = 3_600 * 1_000_000_000
 _LINE_STEP_M: Final = 0.5
+_LANE_COV_M2: Final = 1e-4 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +92,6 @@ def drive_of(task: RouteTask, vehicle: int) -> RoadDrive:
     return drive_route(task.route, vehicle, options)
 
 
-def feature_drive(drive: RoadDrive) -> FeatureDrive:
-    """Return what the vehicle has of a drive."""
-    return FeatureDrive(drive.motion, GnssFixes(drive.gnss.t_ns, drive.gnss.xy_m), drive.looks, drive.lane_looks)
-
-
 def layer_truth(route: Route) -> LayerTruth:
     """Return where the features of a route are, and which way the route goes beside each."""
     way = np.arange(0.0, route.length_m, _LINE_STEP_M)
@@ -103,64 +102,94 @@ def layer_truth(route: Route) -> LayerTruth:
 
 
 def mapped(task: RouteTask, vehicle: int) -> tuple[DriveLayers, list[FeatureReport]]:
-    """Return the layers that a drive makes without and with HD map, and what it reports of the latter.
+    """Return the layers that a drive reports without and with HD map, and the reports of the latter.
 
     Without map only at the usual noise: Figure 8 is of mapping with it.
     """
     drive = drive_of(task, vehicle)
-    taken = feature_drive(drive)
-    without = map_new_layer(taken) if task.is_usual else None
-    with_map = map_new_layer(taken, lanes=lane_map(drive.route.lanes()))
-    layers = DriveLayers(None if without is None else _layer(without), _layer(with_map))
-    return layers, _reports(drive, with_map, vehicle)
+    without = graph_reports(drive, vehicle, None) if task.is_usual else None
+    with_map = graph_reports(drive, vehicle, lane_tiles(drive.route))
+    layers = DriveLayers(None if without is None else _reported(drive.route, without), _reported(drive.route, with_map))
+    return layers, with_map
 
 
-def _layer(found: NewLayer) -> Layer:
-    return Layer(found.features.xy_m, found.features.cov_m2)
+def lane_tiles(route: Route) -> list[FeatureTile]:
+    """Return the lane markings of a route as the layer "lanes" of a map."""
+    tiles: dict[TileId, list[Feature]] = defaultdict(list)
+    for number, lane in enumerate(route.lanes()):
+        line = np.column_stack([lane, np.zeros(len(lane))])
+        marking = Feature(feature_id_of("lane", number), "lane_boundary", line[:2], _LANE_COV_M2, prior(0.95))
+        for tile, piece in pieces_of(marking, *route.frame.geodetic_from_enu(line)):
+            tiles[tile].append(piece)
+    return [FeatureTile.of(tile, 1, found) for tile, found in tiles.items()]
 
 
-def _reports(drive: RoadDrive, found: NewLayer, vehicle: int) -> list[FeatureReport]:
-    features, times = found.features, np.array([look.t_ns for look in drive.looks], np.int64)
-    view = SensorView(drive.view.width_rad, drive.view.range_m, float(drive.view.rate_hz))
-    poses = found.path.at(times)
-    coverage = coverage_along(drive.route.frame, view, poses, [None] * len(poses), float(drive.view.eye_m))
-    discovered = [
-        Discovered(kind, xy, cov, of_counts(hits, 0, CONFIDENCE), hits)
-        for kind, xy, cov, hits in zip(
-            features.kinds, features.xy_m, features.cov_m2, features.hits.tolist(), strict=True
-        )
-    ]
-    base = BaseLayer.empty(drive.route.frame)
-    span = (int(times[0]), int(times[-1]))
-    return reports_of(base, drive.route.layer, f"car-{vehicle}", span, coverage, ([], discovered))
+def graph_reports(drive: RoadDrive, vehicle: int, lanes: Sequence[FeatureTile] | None) -> list[FeatureReport]:
+    """Return what a vehicle reports that maps by a graph (`gnd agent --localise-by graph`); lanes None: without map."""
+    fix, parameters, who, items = _vehicle(drive, vehicle)
+    tiles = None if lanes is None else TilesAtOnce({"lanes": lanes})
+    pipeline = GraphPipeline(fix, parameters, who, feature_tiles=tiles)
+    return reports_of([*map(pipeline.push, items), pipeline.finish()])
+
+
+def _vehicle(drive: RoadDrive, vehicle: int) -> tuple[GnssFix, PipelineParameters, Identity, Iterator[DriveItem]]:
+    """The first fix, the layer of the route as its detector looks for it, who drives, and what was measured."""
+    route, view = drive.route, drive.view
+    layer = LayerParameters(
+        route.layer,
+        "camera",
+        tuple(sorted(set(route.features.kinds))),
+        field_deg=float(np.degrees(view.width_rad)),
+        range_m=view.range_m,
+        detection_confidence=CONFIDENCE,
+    )
+    fix, items = first_fix(items_of(drive), route.name)
+    parameters = PipelineParameters(features=FeatureParameters((layer,)))
+    return fix, parameters, Identity(f"car-{vehicle}", route.name, "none", route.layer), items
+
+
+def _reported(route: Route, reports: list[FeatureReport]) -> Layer:
+    return Layer(*found_in(route.frame, [change for report in reports for change in report.tiles]))
+
+
+def published(reports: list[FeatureReport]) -> dict[TileId, tuple[Feature, ...]]:
+    """Return the layer that the cloud publishes, by tile."""
+    return {tile: one.features for tile, one in merge_layer({}, reports).items()}
 
 
 def integrated(route: Route, reports: list[FeatureReport]) -> Layer:
-    """Return the layer that the cloud publishes."""
-    places = [in_route_frame(route.frame, tile, one.features) for tile, one in merge_layer({}, reports).items()]
-    xy_m, cov_m2 = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
-    for xy, cov in places:
-        xy_m.append(xy)
-        cov_m2.append(cov)
-    return Layer(np.concatenate(xy_m), np.concatenate(cov_m2))
-
-
-def localised(task: RouteTask, vehicle: int, layer: Layer | None) -> LayerLocalised:
-    """Return the errors of a drive's poses at its looks, by motion, GNSS, lanes, and a layer where given."""
-    drive = drive_of(task, vehicle)
-    known = None if layer is None else _known(drive.route, layer)
-    found = localise_with_features(feature_drive(drive), lanes=lane_map(drive.route.lanes()), known=known)
-    times = np.array([look.t_ns for look in drive.looks], np.int64)
-    times = times[(times >= found.path.t_ns[0]) & (times <= found.path.t_ns[-1])]
-    rows = np.searchsorted([look.t_ns for look in drive.looks], times)
-    return LayerLocalised(
-        (times - drive.motion.t_ns[0]) * 1e-9, along_and_across(found.path.at(times), drive.truth.look_poses[rows])
+    """Return the layer that the cloud publishes, in the route's frame."""
+    return Layer(
+        *joined(
+            in_route_frame(route.frame, tile, [(one.position_m, one.cov_m2) for one in features])
+            for tile, features in published(reports).items()
+        )
     )
 
 
-def _known(route: Route, layer: Layer) -> MapFeatures:
-    n, kind = len(layer.xy_m), route.features.kinds[0]
-    return MapFeatures(np.arange(1, n + 1), (kind,) * n, layer.xy_m, np.full(n, np.nan), layer.cov_m2)
+def localised(task: RouteTask, vehicle: int, before: list[FeatureReport] | None) -> LayerLocalised:
+    """Return the errors of the poses that a vehicle has at its looks while it drives (`--localise-by slamcu`).
+
+    Args:
+        task: the route.
+        vehicle: whose drive.
+        before: reports of earlier drives, of which the cloud has published the layer; None: the map has no such layer.
+    """
+    drive = drive_of(task, vehicle)
+    fix, parameters, who, items = _vehicle(drive, vehicle)
+    layer = [FeatureTile.of(tile, 1, features) for tile, features in published(before or []).items() if features]
+    pipeline = CameraPipeline(fix, parameters, who, feature_tiles=TilesAtOnce({drive.route.layer: layer}), seed=vehicle)
+    T, seconds, errors, looks = drive.route.frame.T_self_other(pipeline.place.frame), [], [], 0
+    for item in items:
+        online = pipeline.push(item).online
+        if not isinstance(item, Detections):
+            continue
+        if online is not None:
+            true = drive.truth.look_poses[looks]
+            errors.append(along_and_across(pose_of(T @ online.T_map_vehicle)[None], true[None])[0])
+            seconds.append((item.t_ns - drive.motion.t_ns[0]) * 1e-9)
+        looks += 1
+    return LayerLocalised(np.array(seconds), np.array(errors))
 
 
 def along_and_across(pose: F64, true: F64) -> F64:

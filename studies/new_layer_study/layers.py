@@ -1,4 +1,4 @@
-"""A layer as a drive or the cloud tells it, the truth, how far they are apart, and the paper's results."""
+"""Layers as drives report or the cloud publishes them, the truth, errors, and the paper's results."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ DIRECTIONS: Final = ("euclidean", "lateral", "longitudinal")
 PAPER_SINGLE_M: Final = {"without_map": (1.372, 0.810), "with_map": (0.647, 0.357)}
 """Section 5.2, Figure 6: mean and standard deviation over the beacons."""
 PAPER_INTEGRATED_M: Final = {1: 0.56, 6: 0.14}
-"""Section 5.2, Figure 7: mean error by number of drives, as far as the text tells it."""
+"""Section 5.2, Figure 7: mean error by number of drives, as far as the text gives it."""
 PAPER_TABLE2: Final[Mapping[str, Mapping[str, tuple[float, float]]]] = {
     "without_map": {"euclidean": (5.2718, 0.6877), "lateral": (0.4651, 0.2506), "longitudinal": (5.2445, 0.6944)},
     "with_map": {"euclidean": (4.5284, 0.6418), "lateral": (0.1825, 0.1564), "longitudinal": (4.5220, 0.6418)},
@@ -60,7 +60,7 @@ class LayerTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """J features that are said to exist.
+    """J features that a drive reports or the cloud publishes.
 
     Attributes:
         xy_m: float64 (J, 2), map frame.
@@ -118,10 +118,10 @@ def pooled(scores: list[LayerScore]) -> dict[str, Any]:
     found: dict[str, Any] = {
         name: distances_plain(np.concatenate([one.of(name) for one in scores])) for name in DIRECTIONS
     }
-    told = [one.honesty for one in scores if one.honesty is not None]
-    nees = {"mean": float(np.mean([h.mean for h in told])), "within_95": float(np.mean([h.within for h in told]))}
+    honest = [one.honesty for one in scores if one.honesty is not None]
+    nees = {"mean": float(np.mean([h.mean for h in honest])), "within_95": float(np.mean([h.within for h in honest]))}
     missed, false = (float(np.mean([getattr(one, name) for one in scores])) for name in ("missed", "false"))
-    return found | {"missed": missed, "false": false, "nees": nees if told else None}
+    return found | {"missed": missed, "false": false, "nees": nees if honest else None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from gnd.gnd_map.config import to_mapping
-from gnd.schemas.features import FeatureReport
-from studies.feature_study.reporting import read_reports, write_reports
+from studies.feature_study.pipelines import read_reports, write_reports
 from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import OptionError
 from studies.frame.kept import Kept, key_of, sources_sha
@@ -31,7 +30,7 @@ SOURCES: Final = (
     "fleet_sim/drives.py",
     "gnd_map",
     "schemas",
-    "vehicle_agent/features",
+    "vehicle_agent",
     "studies/feature_study",
     "studies/new_layer_study/driving.py",
 )
@@ -206,14 +205,9 @@ def map_drive(task: MappingTask) -> None:
 
 def localise_drive(task: LocalisingTask) -> None:
     """Merge, localise a fresh drive without and with the layer; runs in a worker process."""
-    layer = integrated(task.route.route, _all_reports(task.before))
-    vehicle = len(task.before) + 1
-    found = {"without": localised(task.route, vehicle, None), "with_layer": localised(task.route, vehicle, layer)}
+    before, vehicle = [report for one in task.before for report in read_reports(one.reports)], len(task.before) + 1
+    found = {"without": localised(task.route, vehicle, None), "with_layer": localised(task.route, vehicle, before)}
     task.kept.write(found)
-
-
-def _all_reports(tasks: tuple[MappingTask, ...]) -> list[FeatureReport]:
-    return [report for task in tasks for report in read_reports(task.reports)]
 
 
 def _read(options: NewLayerOptions, plan: SeedTasks) -> NewLayerSeed:

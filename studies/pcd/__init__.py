@@ -3,23 +3,17 @@
 from studies.pcd.detector import PcdDetector
 from studies.pcd.merge import evaluate_gnd, merge_pcd, settled
 from studies.pcd.points import (
-    PcdCodecError,
-    PcdDetectParameters,
     PcdError,
     PcdMap,
-    PcdMergeParameters,
     base_pcd,
     gnd_of,
 )
 from studies.pcd.report import PcdReport
 
 __all__ = [
-    "PcdCodecError",
-    "PcdDetectParameters",
     "PcdDetector",
     "PcdError",
     "PcdMap",
-    "PcdMergeParameters",
     "PcdReport",
     "base_pcd",
     "evaluate_gnd",

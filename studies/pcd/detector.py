@@ -8,7 +8,21 @@ from gnd.gnd_map.errors import ShapeError
 from gnd.gnd_map.evidence import ChangeState, masses, states
 from studies.pcd.index import PcdIndex, index_of
 from studies.pcd.kernel import CELLS, EMPTY, SIDE, PcdCounts, Rules, cast_rays, support_sums
-from studies.pcd.points import PcdDetectParameters, PcdMap
+from studies.pcd.points import (
+    AHEAD_M,
+    BESIDE_M,
+    BEYOND_M,
+    MASSES,
+    MIN_PASS_POINTS,
+    MIN_PASSES,
+    NEAR_M,
+    NEW_MASSES,
+    NEW_SUPPORT_CELLS,
+    PLANAR_RATIO,
+    RANGE_M,
+    SUPPORT_CELLS,
+    PcdMap,
+)  # fmt: skip
 from studies.pcd.report import PcdReport
 
 _FIRST_ROWS = 1 << 12
@@ -17,12 +31,10 @@ _FIRST_ROWS = 1 << 12
 class PcdDetector:
     """Ray casting on map points, each with its own evidence (the paper's [44])."""
 
-    def __init__(self, base: PcdMap, parameters: PcdDetectParameters | None = None) -> None:
+    def __init__(self, base: PcdMap) -> None:
         self.base = base
-        self.parameters = parameters or PcdDetectParameters()
-        self.index = index_of(base, self.parameters.planar_ratio)
-        p = self.parameters
-        self._rules = Rules(p.near_m, p.beyond_m, p.beside_m, p.ahead_m, p.range_min_m, p.range_max_m)
+        self.index = index_of(base, PLANAR_RATIO)
+        self._rules = Rules(NEAR_M, BEYOND_M, BESIDE_M, AHEAD_M, *RANGE_M)
         self._used = 0
         self._counts = _no_counts(self.index)
 
@@ -65,28 +77,28 @@ class PcdDetector:
 
     def _deleted_cells(self) -> NDArray[np.bool_]:
         """(U,) map cells whose evidence, with that of the cells around, says "changed"."""
-        p, c = self.parameters, self._counts
+        c = self._counts
         at, zero = self.index, np.zeros(len(self.index.cells), np.int32)
         hits, passes = support_sums(
-            at.base, at.state, at.cells, c.map_hits, c.map_passes, p.support_cells, p.min_pass_points
+            at.base, at.state, at.cells, c.map_hits, c.map_passes, SUPPORT_CELLS, MIN_PASS_POINTS
         )
-        touched = np.flatnonzero(passes >= max(p.min_pass_points, 1))
+        touched = np.flatnonzero(passes >= max(MIN_PASS_POINTS, 1))
         some = zero[touched]
-        state = states(masses(hits[touched], some, some, passes[touched], p.masses))
+        state = states(masses(hits[touched], some, some, passes[touched], MASSES))
         deleted = np.zeros(len(zero), np.bool_)
         deleted[touched[state == ChangeState.CHANGED]] = True
         return deleted
 
     def _new_points(self) -> F32:
         """(K, 3) float32 centroids, map frame, of the new cells whose evidence says "changed"."""
-        c, p, used = self._counts, self.parameters, self._used
+        c, used = self._counts, self._used
         row, cell = np.nonzero(c.new_hits[:used])
         corner = self.index.corners_of(c.new_block[row])
         at = corner + np.stack(np.unravel_index(cell, (SIDE,) * 3), axis=1)
         hits = c.new_hits[row, cell]
-        support = box_sums(at, hits, p.new_support_cells)
+        support = box_sums(at, hits, NEW_SUPPORT_CELLS)
         zero = np.zeros(len(hits), np.int64)
-        state = states(masses(c.new_passes[row, cell], zero, zero, support, p.new_masses))
+        state = states(masses(c.new_passes[row, cell], zero, zero, support, NEW_MASSES))
         new = state == ChangeState.CHANGED
         fraction = c.new_sum[row, cell][new].astype(np.float64) / hits[new, None]
         return self.index.points_at(at[new] + fraction).astype(np.float32)
@@ -96,7 +108,7 @@ class PcdDetector:
         c, base = self._counts, self.index.base
         seen = np.add.reduceat((c.map_hits > 0) | (c.map_passes > 0) | deleted, base.start, dtype=np.int32) > 0
         of_map = np.flatnonzero((c.state >= 0) & (c.state < len(base.start)))
-        empty = np.flatnonzero(EMPTY - c.state >= self.parameters.min_passes)
+        empty = np.flatnonzero(EMPTY - c.state >= MIN_PASSES)
         parts = of_map[seen[c.state[of_map]]], empty, c.new_block[: self._used]
         return np.unique(np.concatenate(parts)).astype(np.int32)
 

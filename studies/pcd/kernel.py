@@ -65,7 +65,7 @@ class PcdCounts(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """`PcdDetectParameters` as the kernels read them."""
+    """The rules of `studies.pcd.points` as the kernels read them."""
 
     near_m: float
     beyond_m: float

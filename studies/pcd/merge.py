@@ -1,7 +1,6 @@
 """Reports about a point cloud merged, and scored as Gaussians."""
 
 from collections.abc import Mapping, Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +14,12 @@ from gnd.gnd_map.similarity import similarity
 from gnd.gnd_map.tile_id import TileId
 from studies.pcd.index import PcdIndex, index_of
 from studies.pcd.points import (
-    PcdDetectParameters,
+    PLANAR_RATIO,
+    REACH_CELLS,
+    SIMILAR,
+    XI,
     PcdError,
     PcdMap,
-    PcdMergeParameters,
     cell_keys,
     cells_of,
     key_cells,
@@ -27,21 +28,20 @@ from studies.pcd.points import (
 from studies.pcd.report import PcdReport
 
 
-def merge_pcd(base: PcdMap, reports: Sequence[PcdReport], parameters: PcdMergeParameters | None = None) -> PcdMap:
+def merge_pcd(base: PcdMap, reports: Sequence[PcdReport]) -> PcdMap:
     """The map after the changes on which more than ξ of the observers agree; the order of reports does not matter.
 
     Raises:
         PcdError: a report refers to another map.
     """
-    parameters = parameters or PcdMergeParameters()
     for report in reports:
         if report.map_size != len(base):
             raise PcdError(f"a report refers to a map of {report.map_size} points, this one has {len(base)}")
     if not reports:
         return base
-    index = index_of(base, PcdDetectParameters().planar_ratio)
+    index = index_of(base, PLANAR_RATIO)
     seen = _Observers(index, reports)
-    return without(base, _deleted(base, index, seen, reports, parameters), _new(index, seen, reports, parameters))
+    return without(base, _deleted(base, index, seen, reports), _new(index, seen, reports))
 
 
 class _Observers:
@@ -56,27 +56,25 @@ class _Observers:
         return np.asarray(np.where(blocks >= 0, self._count[blocks], 0), np.int32)
 
 
-def _deleted(
-    base: PcdMap, index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport], p: PcdMergeParameters
-) -> NDArray[np.bool_]:
+def _deleted(base: PcdMap, index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport]) -> NDArray[np.bool_]:
     votes = np.zeros(len(base), np.int32)
     for report in reports:
         votes[report.deleted_index] += 1
     blocks = index.blocks_of(index.cells.astype(np.int64))[index.cell_of_point]
-    return np.asarray(votes > p.xi * np.maximum(seen.of(blocks), votes))
+    return np.asarray(votes > XI * np.maximum(seen.of(blocks), votes))
 
 
-def _new(index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport], p: PcdMergeParameters) -> F32:
+def _new(index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport]) -> F32:
     """Centroids of the new cells for which enough reports have a new point in or beside the cell."""
     clouds = [report.new_points.astype(np.float64) for report in reports]
     cells = [cells_of(cloud, index.grid_frame) for cloud in clouds]
     key, which = np.unique(cell_keys(np.concatenate(cells), index.grid_frame), return_inverse=True)
     owner = np.repeat(np.arange(len(reports)), [len(c) for c in cells])
-    said = np.zeros((len(key), -(-len(reports) // 64)), np.uint64)
-    np.bitwise_or.at(said, (which, owner // 64), np.uint64(1) << (owner % 64).astype(np.uint64))
-    votes = count_votes(key, said, p.reach_cells)
+    reported = np.zeros((len(key), -(-len(reports) // 64)), np.uint64)
+    np.bitwise_or.at(reported, (which, owner // 64), np.uint64(1) << (owner % 64).astype(np.uint64))
+    votes = count_votes(key, reported, REACH_CELLS)
     blocks = index.blocks_of(key_cells(key, index.grid_frame) - index.origin_c)
-    accepted = votes > p.xi * np.maximum(seen.of(blocks), votes)
+    accepted = votes > XI * np.maximum(seen.of(blocks), votes)
     return _means(np.concatenate(clouds), which, len(key))[accepted]
 
 
@@ -88,13 +86,13 @@ def _means(points: F64, which: I64, n: int) -> F32:
 
 
 @kernel
-def count_votes(keys: I64, said: NDArray[np.uint64], reach: int) -> I32:
+def count_votes(keys: I64, reported: NDArray[np.uint64], reach: int) -> I32:
     """(C,) int32: how many reports have a point within `reach` cells of each cell.
 
-    `keys` (C,) sorted cell keys; `said` (C, W): bit r of word w is set where report 64 w + r has a point.
+    `keys` (C,) sorted cell keys; `reported` (C, W): bit r of word w is set where report 64 w + r has a point.
     """
     votes = np.zeros(len(keys), np.int32)
-    word = np.empty(said.shape[1], np.uint64)
+    word = np.empty(reported.shape[1], np.uint64)
     for c in range(len(keys)):
         word[:] = 0
         for dx in range(-reach, reach + 1):
@@ -103,7 +101,7 @@ def count_votes(keys: I64, said: NDArray[np.uint64], reach: int) -> I32:
                 at = np.searchsorted(keys, middle - reach)
                 while at < len(keys) and keys[at] <= middle + reach:
                     for w in range(len(word)):
-                        word[w] |= said[at, w]
+                        word[w] |= reported[at, w]
                     at += 1
         for w in range(len(word)):
             bits = word[w]
@@ -114,7 +112,6 @@ def count_votes(keys: I64, said: NDArray[np.uint64], reach: int) -> I32:
 
 
 Tiles = Mapping[TileId, Gaussians]
-SIMILAR: Final = PcdMergeParameters().similar
 
 
 def settled(before: Tiles, after: Tiles, similar: float = SIMILAR) -> dict[TileId, Gaussians]:

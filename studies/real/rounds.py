@@ -239,9 +239,6 @@ def changed_by_shadow(before: Cells, after: Cells) -> I64:
     return np.asarray(keys[before.count_at(keys) != after.count_at(keys)])
 
 
-SAMPLED = 7
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Method:
     """How the vehicle works: detection, segmentation of its own scans and of the map's, where poses come from."""
@@ -264,10 +261,6 @@ class Untouched:
     driven: Cells
     moving: Cells
     """Points of the driven half that were marked as moving."""
-    sample_m: NDArray[np.float32]
-    """(N, 3) every `SAMPLED`th point of the driven half, for pictures."""
-    sample_moving: NDArray[np.bool_]
-    """(N,) which of them were marked."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -328,7 +321,7 @@ def _untouched(scene: RecordedScene, mapping: list[Scan], driving: list[Scan], m
     found = detect(scene, local_map, notes.noted(scans), method.detect)
     seen = detect(scene, local_map, segmented(map(scene.refined, mapping), method.segment), method.detect).keys
     driven, moving = Cells.of(notes.driven), Cells.of(notes.moving)
-    return Untouched(found, tiles, seen, Cells.of(points), driven, moving, *notes.sample())
+    return Untouched(found, tiles, seen, Cells.of(points), driven, moving)
 
 
 class _Notes:
@@ -336,20 +329,13 @@ class _Notes:
 
     def __init__(self, scene: RecordedScene) -> None:
         self.driven, self.moving = VoxelAccumulator(scene.grid_frame), VoxelAccumulator(scene.grid_frame)
-        self._points: list[NDArray[np.float32]] = [np.empty((0, 3), np.float32)]
-        self._marks: list[NDArray[np.bool_]] = [np.empty(0, np.bool_)]
 
     def noted(self, scans: Iterable[SegmentedScan]) -> Iterator[SegmentedScan]:
         for one in scans:
             near, points = in_range(one.scan), one.scan.points_map_m
             self.driven.add(points[near])
             self.moving.add(points[near & one.moving])
-            self._points.append(points[near][::SAMPLED].astype(np.float32))
-            self._marks.append(one.moving[near][::SAMPLED])
             yield one
-
-    def sample(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        return np.concatenate(self._points), np.concatenate(self._marks)
 
 
 def _inserted(

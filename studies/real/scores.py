@@ -156,11 +156,11 @@ def _class_scores(rounds: Sequence[Round], change: ChangeClass) -> dict[str, Any
         found, truth = r.inserted.found, r.inserted.truth
         wanted = truth.new if change is ChangeClass.NEW else truth.measured
         wider = truth.new if change is ChangeClass.NEW else truth.deleted
-        says = found.where(change) & ~np.isin(found.keys, truth.ignored)
-        right = np.isin(found.keys[says], wider)
-        true, hit = true + len(wanted), hit + int(np.isin(wanted, found.keys[says]).sum())
-        reported += int(says.sum()) - int((right & ~np.isin(found.keys[says], wanted)).sum())
-        near += int((~right & _near_objects(r, found.mean_m[says])).sum())
+        claimed = found.where(change) & ~np.isin(found.keys, truth.ignored)
+        right = np.isin(found.keys[claimed], wider)
+        true, hit = true + len(wanted), hit + int(np.isin(wanted, found.keys[claimed]).sum())
+        reported += int(claimed.sum()) - int((right & ~np.isin(found.keys[claimed], wanted)).sum())
+        near += int((~right & _near_objects(r, found.mean_m[claimed])).sum())
     return {
         "true": true,
         "found": hit,

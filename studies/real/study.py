@@ -91,16 +91,15 @@ def real(options: RealOptions, bench: Bench) -> StudyReport:
     Objects are inserted ray-accurately into the map's scans (they are gone, then) and into the vehicle's (they are
     new); the untouched scans tell how much is reported although nothing changed.
     """
-    found = reproduce_real(options, bench.folder.root if bench.pictures else None, bench.step)
+    found = reproduce_real(options, bench.step)
     return StudyReport(found, sheets_of(found), file=f"{found['recording']}.json")
 
 
-def reproduce_real(options: RealOptions, out: Path | None, progress: Progress) -> dict[str, Any]:
+def reproduce_real(options: RealOptions, progress: Progress) -> dict[str, Any]:
     """Measure detection on a recording; give the result as plain values.
 
     Args:
         options: what to do.
-        out: folder for pictures of the first round, None for none.
         progress: called with a step's name, how much is done, and of how much.
 
     Raises:
@@ -116,14 +115,10 @@ def reproduce_real(options: RealOptions, out: Path | None, progress: Progress) -
     for number in range(options.rounds):
         rounds.append(run_round(recorded, halves, number, options.objects, options.seed, method))
         progress("rounds", number + 1, options.rounds)
-    from studies.real.pictures import draw_round
-
-    pictures = draw_round(rounds[0], out) if out is not None else []
     return {
         "recording": recorded.name,
         "scans": len(recorded.scans),
         "left_out": list(recorded.left_out),
-        "pictures": [path.name for path in pictures],
         **summary_of(rounds),
         "options": asdict(options) | {"scans": options.scans.name},
         "parameters": {"detect": asdict(method.detect), "segment": asdict(method.segment)},

@@ -134,11 +134,11 @@ def dead_reckoned(reference: Reference, errors: SensorErrors = ERRORS, seed: int
     return Trajectory(reference.t_ns, T_from_R_t(exp_so3(np.column_stack([np.zeros((len(yaw), 2)), yaw])), p))
 
 
-def nagoya_of(folder: Path) -> tuple[dict[str, Any], dict[str, Georeferenced]]:
-    """The same track by each kind of fixes, against the reference; also the tracks, for pictures."""
+def nagoya_of(folder: Path) -> dict[str, Any]:
+    """The same track by each kind of fixes, against the reference."""
     reference = read_reference(folder / "reference.csv")
     whole = dead_reckoned(reference)
-    track, rows, tracks = Trajectory(whole.t_ns[::EVERY], whole.T_dst_vehicle[::EVERY]), list[dict[str, Any]](), {}
+    track, rows = Trajectory(whole.t_ns[::EVERY], whole.T_dst_vehicle[::EVERY]), list[dict[str, Any]]()
     reference = reference.chosen(slice(None, None, EVERY))
     for name, fixes in _fixes(folder).items():
         rigid, bent = (georeference(track, fixes, drift=drift) for drift in (False, True))
@@ -148,9 +148,8 @@ def nagoya_of(folder: Path) -> tuple[dict[str, Any], dict[str, Georeferenced]]:
         row |= {"rigid_off_m": _quantiles(track_off(rigid, reference)), "off_m": _quantiles(track_off(bent, reference))}
         row |= {"heading_deg": _quantiles(np.degrees(_heading_off(bent, reference)))}
         rows.append(row)
-        tracks[name] = bent
     way_m = float(np.linalg.norm(np.diff(whole.T_dst_vehicle[:, :3, 3], axis=0), axis=1).sum())
-    return {"poses": len(track), "way_m": way_m, "by": rows}, tracks
+    return {"poses": len(track), "way_m": way_m, "by": rows}
 
 
 def _fixes(folder: Path) -> dict[str, FixTable]:

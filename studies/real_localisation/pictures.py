@@ -18,7 +18,6 @@ from studies.frame.figures import INK, save
 from studies.real.scene import RecordedScans
 from studies.real_localisation.flexmap import DrawnFlexmap
 from studies.real_localisation.halves import METHODS, Half, localised
-from studies.real_localisation.nagoya import read_reference, track_off
 from studies.real_localisation.odometry import OdometryResult
 
 F64 = NDArray[np.float64]
@@ -91,29 +90,6 @@ def draw_flexmap(drawn: DrawnFlexmap, name: str, folder: Path) -> list[Path]:
     whole.legend(loc="best", fontsize=8)
     corner = np.array(_xy(drawn.bent)).T[int(0.3 * len(drawn.bent.track))]
     near.set(xlim=(corner[0] - 45, corner[0] + 45), ylim=(corner[1] - 45, corner[1] + 45), title="from near")
-    return [save(figure, folder / f"{name}_georeferenced.png")]
-
-
-def draw_nagoya(source: Path, tracks: dict[str, Georeferenced], name: str, folder: Path) -> list[Path]:
-    """The reference and the tracks by each kind of fixes, and what they are off by."""
-    whole = read_reference(source / "reference.csv")
-    figure = Figure(figsize=(16.0, 7.5), layout="constrained")
-    above, errors = figure.subplots(1, 2, width_ratios=(1.0, 1.4))
-    frame = next(iter(tracks.values())).frame
-    p = whole.enu_m(frame)
-    above.plot(p[:, 0], p[:, 1], "-", color=INK, lw=3.0, alpha=0.35, label="reference")
-    for colour, (label, found) in zip(COLOURS, tracks.items(), strict=False):
-        at = np.isin(whole.t_ns, found.track.t_ns)
-        p = (frame.T_self_other(found.frame) @ found.track.T_dst_vehicle)[:, :3, 3]
-        above.plot(p[:, 0], p[:, 1], "-", color=colour, lw=1.0, label=label)
-        off = track_off(found, whole.chosen(np.flatnonzero(at)))
-        errors.semilogy(
-            (found.track.t_ns - whole.t_ns[0]) * 1e-9, np.maximum(off, 1e-3), color=colour, lw=0.9, label=label
-        )
-    above.set(aspect="equal", xlabel="east m", ylabel="north m", title=f"{name}: wheel and gyro put on the Earth")
-    above.legend(fontsize=8)
-    errors.set(xlabel="time s", ylabel="horizontal distance from the reference m")
-    errors.legend(fontsize=8)
     return [save(figure, folder / f"{name}_georeferenced.png")]
 
 

@@ -23,7 +23,7 @@ from studies.real_localisation.flexmap import flexmap_of, is_flexmap
 from studies.real_localisation.halves import SPLITS, Half, localisation_of
 from studies.real_localisation.nagoya import is_nagoya, nagoya_of
 from studies.real_localisation.odometry import compared, odometries
-from studies.real_localisation.pictures import draw_flexmap, draw_halves, draw_nagoya
+from studies.real_localisation.pictures import draw_flexmap, draw_halves
 
 _METHODS: Final = {"with_submap": "yes", "without_submap": "no", "without_submap_and_wheels": "no, no wheels"}
 _ODOMETRY: Final = {
@@ -208,9 +208,7 @@ def _measured(folder: Path, options: RealLocalisationOptions, out: Path | None, 
         files = [] if out is None else draw_flexmap(drawn, folder.name, out)
         return {"kind": "track and GNSS without times", **result, "pictures": _names(files)}
     if folder.is_dir() and is_nagoya(folder):
-        result, tracks = nagoya_of(folder)
-        files = [] if out is None else draw_nagoya(folder, tracks, folder.name, out)
-        return {"kind": "wheel and gyro, GNSS and reference", **result, "pictures": _names(files)}
+        return {"kind": "wheel and gyro, GNSS and reference", **nagoya_of(folder), "pictures": []}
     recording, kind = _opened(folder)
     if kind == "apollo" and len(recording) == 2:
         return {"kind": "two scans with poses and Apollo's map", **_pair(folder, recording)}

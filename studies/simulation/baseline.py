@@ -16,10 +16,6 @@ from gnd.vehicle_agent.segment import SegmentedScan
 from studies.frame.errors import FolderError
 from studies.frame.kept import read_npz, write_npz
 from studies.pcd import PcdDetector, PcdMap, PcdReport, base_pcd, evaluate_gnd, gnd_of, merge_pcd
-from studies.pcd.report import CODECS, Codec
-
-UPLOADED: Codec = "points"
-"""What counts as the baseline's upload, as in the paper: every new and every deleted point with its coordinates."""
 
 
 def write_cloud(world: World, path: Path) -> None:
@@ -61,11 +57,10 @@ class CloudVehicle:
         points, origins = transform(T, scan.points_map_m), transform(T, scan.origins_map_m)
         self._detector.add_scan(points, origins, segmented.moving)
 
-    def report(self) -> tuple[bytes, Mapping[str, int]]:
-        """Return what is uploaded, and its size in each of the baseline's codecs."""
+    def report(self) -> tuple[PcdReport, Mapping[str, int]]:
+        """Return what is uploaded, and its size in each of the baseline's codecs; "points" is the paper's."""
         found = self._detector.finish()
-        sizes: dict[str, int] = {codec: len(found.encode(codec, self._base)) for codec in CODECS}
-        return found.encode(UPLOADED, self._base), sizes
+        return found, found.sizes(self._base)
 
 
 class Clouds:
@@ -75,9 +70,8 @@ class Clouds:
         self._truth, self._base = truth, base
         self._before = self._gaussians(base)
 
-    def score(self, bodies: list[bytes]) -> Evaluation:
+    def score(self, reports: list[PcdReport]) -> Evaluation:
         """Return the score of the map that the baseline makes of these uploads."""
-        reports = [PcdReport.decode(body, self._base) for body in bodies]
         return evaluate_gnd(self._truth, self._before, self._gaussians(merge_pcd(self._base, reports)))
 
     def _gaussians(self, cloud: PcdMap) -> dict[TileId, Gaussians]:

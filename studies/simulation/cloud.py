@@ -48,7 +48,7 @@ def merged_map(base: BaseMap, bodies: Sequence[bytes], parameters: MergeParamete
 
 
 def map_of_one(base: BaseMap, bodies: Iterable[bytes]) -> dict[TileId, Gaussians]:
-    """Return the base map with what one vehicle says about it, no cloud in between."""
+    """Return the base map with what one vehicle reports, no cloud in between."""
     final = dict(base.tiles)
     for tile, reports in reports_of_tiles(bodies, MergeParameters()).items():
         for report in reports:
@@ -102,8 +102,8 @@ class _StudyCloud:
             bodies.append(whole.encode())
             sent_bytes += len(half or body) + second
             for change in whole.tiles:
-                said = self._merge.report_of(whole.report_id, whole.sensor_model, change)
-                self._held[change.tile].append(said)
+                statement = self._merge.report_of(whole.report_id, whole.sensor_model, change)
+                self._held[change.tile].append(statement)
         return Arrived(tuple(bodies), sent_bytes)
 
     def _asked(self, body: bytes, half: bytes) -> tuple[ChangeReport, int]:

@@ -1,4 +1,4 @@
-"""The figures of a reproduction: map changes (GND, Figure 16), F1 by number of vehicles (Figure 17), masses."""
+"""The figures of a reproduction: map changes (GND, Figure 16), F1 by number of vehicles (Figure 17)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,17 +12,12 @@ from matplotlib.ticker import MaxNLocator
 from gnd.fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
 from gnd.fleet_sim.pictures import StreetView, draw_map
 from gnd.fleet_sim.truth import LEVELS, Truth, read_truth
-from gnd.gnd_map.arrays import F64, I32, I64
-from gnd.gnd_map.classes import CLASS_COLOURS
-from gnd.gnd_map.evidence import MassParameters, masses
 from studies.frame.figures import INK, PALE, dress, save
 from studies.simulation import scores as reference
 from studies.simulation.cloud import arrived, map_of_one, merged_map
-from studies.simulation.masses import WATCHED, VoxelWatch, choose, most_telling
 from studies.simulation.scores import SimulationOutcome, WorldOutcome, target_single
 from studies.simulation.worlds import read_world_base
 
-_MASSES: Final = (("m(S) sustained", "#2f6fb5"), ("m(C) changed", "#d1433f"), ("m(Ω) unknown", "#8a94a3"))
 _LEVEL_NAMES: Final = {"all": "all voxels", "marginal_excluded": "marginal excluded", "scored": "scored voxels"}
 _LEVEL_STYLE: Final = {"scored": "-", "marginal_excluded": "--", "all": ":"}
 
@@ -37,11 +32,6 @@ def draw_figures(outcome: SimulationOutcome, summary: Mapping[str, Any], folder:
     truth = read_truth(world.files.truth)
     paths = draw_changes(outcome, world, truth, folder)
     paths.append(draw_curve(summary, folder / "f1_by_vehicles.png"))
-    watch = choose(truth)
-    watched = next((vehicle for vehicle in world.vehicles if len(vehicle.watched[0])), None)
-    if watch is not None and watched is not None:
-        parameters = outcome.options.method.detect.masses
-        paths.append(draw_masses(watch, watched.watched, parameters, watched.sensor, folder / "masses.png"))
     return paths
 
 
@@ -136,39 +126,6 @@ def _baseline(axes: Axes, summary: Mapping[str, Any]) -> list[float]:
     if values:
         axes.plot(numbers, values, "o-", color="#8455a8", linewidth=1.6, markersize=4, label="point clouds, scored")
     return values
-
-
-def draw_masses(
-    watch: VoxelWatch, history: tuple[I64, I32], parameters: MassParameters, sensor: str, path: Path
-) -> Path:
-    """Draw m(S), m(C), m(Ω) of one voxel of each class over the scans of one drive."""
-    figure = Figure(figsize=(11.0, 6.8), dpi=150, facecolor="white")
-    t_ns, counters = history
-    axes = figure.subplots(2, 2, sharex=True, sharey=True)
-    figure.subplots_adjust(left=0.065, right=0.985, top=0.84, bottom=0.08, hspace=0.22, wspace=0.07)
-    for panel, index, change_class in zip(axes.flat, most_telling(watch, counters), WATCHED, strict=True):
-        dress(panel, "", "")
-        name = f"a {change_class.name.lower()} voxel"
-        if index >= 0:
-            _mass_lines(panel, (t_ns - t_ns[0]) * 1e-9, counters[:, index], parameters)
-            rays = dict(zip(("BI", "BO", "BE", "PI"), counters[-1, index].tolist(), strict=True))
-            name += "  (" + ", ".join(f"{k} {v}" for k, v in rays.items() if v) + ")"
-        panel.set_title(name, fontsize=11, color=CLASS_COLOURS[change_class], loc="left", weight="bold")
-        panel.set_ylim(-0.03, 1.03)
-    for panel in axes[1]:
-        panel.set_xlabel("seconds since the first ray", color=INK)
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.99, 0.985), ncols=3, frameon=False)
-    _title(figure, "Masses of single voxels", f"one drive, {sensor}; rays counted in brackets")
-    return save(figure, path)
-
-
-def _mass_lines(axes: Axes, t_s: F64, counters: I32, parameters: MassParameters) -> None:
-    """Eq. (11) after each scan, from counters (S, 4) n_BI, n_BO, n_BE, n_PI up to it."""
-    n_bi, n_bo, n_be, n_pi = counters.T
-    values = masses(n_bi, n_bo, n_be, n_pi, parameters)
-    for column, (label, colour) in enumerate(_MASSES):
-        axes.step(t_s, values[:, column], where="post", color=colour, linewidth=1.9, label=label)
 
 
 def _title(figure: Figure, title: str, note: str) -> None:

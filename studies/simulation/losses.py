@@ -60,30 +60,30 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
         e: the vehicle's evidence there, of `columns_at`.
         p: the parameters that it decided with.
     """
-    said, t = e["change_class"], true_class
-    silent = said == int(ChangeClass.UNMEASURED)
+    predicted, t = e["change_class"], true_class
+    silent = predicted == int(ChangeClass.UNMEASURED)
     weak = (e["cells"] >= p.rules.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, MIN_CELLS, p.new_cells))
     many = (e["map_cells"] == 0) & (e["cells"] >= p.new_cells)
     part = e["cells"] < 0.5 * e["map_cells"]
     cases = (
         (e["seen"] == 0, UNSEEN),
-        (said == t, RIGHT),
+        (predicted == t, RIGHT),
         (silent & weak, FEW_CELLS),
         (silent & many, EDGE),
         (silent, FEW_RAYS),
-        ((t == A) & (said == E) & (e["cells"] > 0), "empty: too few sub-cells met"),
-        ((t == A) & (said == E), "empty: rays pass, nothing met"),
-        ((t == E) & (said == A), "new: something stood or moved there"),
-        ((t == M) & (said == N) & (e["cells"] < MIN_CELLS), "normal: too few sub-cells for a Gaussian"),
-        ((t == M) & (said == N) & part, "normal: only a part of it seen"),
-        ((t == M) & (said == N), "normal: the Gaussians are too alike"),
-        ((t == M) & (said == D), "deleted: rays pass, too few sub-cells"),
-        ((t == N) & (said == M) & part, "modified: only a part of it seen"),
-        ((t == N) & (said == M), "modified: unlike the map's Gaussian"),
-        ((t == N) & (said == D), "deleted: rays pass through what stands"),
-        ((t == D) & (said == N) & (e["cells"] >= p.rules.weak_cells), "normal: points met where it stood"),
-        ((t == D) & (said == N), "normal: too few rays passed"),
-        ((t == D) & (said == M), "modified: something else met there"),
+        ((t == A) & (predicted == E) & (e["cells"] > 0), "empty: too few sub-cells met"),
+        ((t == A) & (predicted == E), "empty: rays pass, nothing met"),
+        ((t == E) & (predicted == A), "new: something stood or moved there"),
+        ((t == M) & (predicted == N) & (e["cells"] < MIN_CELLS), "normal: too few sub-cells for a Gaussian"),
+        ((t == M) & (predicted == N) & part, "normal: only a part of it seen"),
+        ((t == M) & (predicted == N), "normal: the Gaussians are too alike"),
+        ((t == M) & (predicted == D), "deleted: rays pass, too few sub-cells"),
+        ((t == N) & (predicted == M) & part, "modified: only a part of it seen"),
+        ((t == N) & (predicted == M), "modified: unlike the map's Gaussian"),
+        ((t == N) & (predicted == D), "deleted: rays pass through what stands"),
+        ((t == D) & (predicted == N) & (e["cells"] >= p.rules.weak_cells), "normal: points met where it stood"),
+        ((t == D) & (predicted == N), "normal: too few rays passed"),
+        ((t == D) & (predicted == M), "modified: something else met there"),
     )
     return np.select([case for case, _ in cases], [name for _, name in cases], OTHER)
 
@@ -145,9 +145,9 @@ def fleet_losses(case: LossCase, n: int, level: Level) -> list[Loss]:
     rows = _wrong(case.truth, predicted, level)
     true = case.truth.change_class[rows]
     each = np.stack([causes(true, columns_at(vehicle, rows), case.method.detect) for vehicle in vehicles])
-    said = np.stack([columns_at(vehicle, rows)["change_class"] for vehicle in vehicles])
+    reported = np.stack([columns_at(vehicle, rows)["change_class"] for vehicle in vehicles])
     exact = predicted_by(case.exact, case.exact.vehicles[:n], merge=True) if case.exact else None
-    return _losses(case, predicted, rows, _vote_causes(true, said, each, case.method.merge.xi), level, exact)
+    return _losses(case, predicted, rows, _vote_causes(true, reported, each, case.method.merge.xi), level, exact)
 
 
 def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bool = False) -> ClassArray:
@@ -157,10 +157,10 @@ def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bo
     return classes_of_maps(case.truth, case.base.tiles, final)
 
 
-def _vote_causes(true: NDArray[np.uint8], said: NDArray[np.int32], each: Causes, xi: float) -> Causes:
+def _vote_causes(true: NDArray[np.uint8], reported: NDArray[np.int32], each: Causes, xi: float) -> Causes:
     """How the votes (vehicles, R) fell, with the commonest cause among those that did not say what is true."""
-    spoke = said != int(ChangeClass.UNMEASURED)
-    right, votes = (said == true).sum(axis=0), spoke.sum(axis=0)
+    spoke = reported != int(ChangeClass.UNMEASURED)
+    right, votes = (reported == true).sum(axis=0), spoke.sum(axis=0)
     found = []
     for r in range(len(true)):
         why = Counter(c for c in each[:, r].tolist() if c not in (RIGHT, UNSEEN)).most_common(1)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.segment import SegmentedScan
 from studies.frame.errors import FolderError
 from studies.frame.kept import read_value, write_value
+from studies.pcd import PcdReport
 from studies.simulation.options import MethodParameters
 
 EVIDENCE: Final = ("n_bi", "n_bo", "n_pi", "n_po", "n_be", "n_pe", "cells", "map_cells", "change_class")
@@ -35,8 +36,7 @@ class VehicleResult:
         row: int32 (K,) rows of the truth about which there is evidence, ascending.
         evidence: int32 columns (K,), see `EVIDENCE`.
         stats: counts, localisation errors; plain values.
-        watched: times int64 (S,) and counters int32 (S, W, 4) of the watched voxels; empty for most vehicles.
-        pcd: the baseline's encoded report; empty without it.
+        pcd: the baseline's report; None without it.
         packed: the first half of each report in short, as the vehicle's outbox holds it; empty where it has none.
     """
 
@@ -46,10 +46,7 @@ class VehicleResult:
     row: NDArray[np.int32]
     evidence: Mapping[str, NDArray[np.int32]]
     stats: Mapping[str, Any]
-    watched: tuple[NDArray[np.int64], NDArray[np.int32]] = field(
-        default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 0, 4), np.int32))
-    )
-    pcd: bytes = b""
+    pcd: PcdReport | None = None
     packed: tuple[bytes, ...] = ()
 
     @property

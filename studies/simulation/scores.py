@@ -109,8 +109,8 @@ def score_pcd(files: WorldFiles, vehicles: Sequence[VehicleFile], numbers: Seque
 
     clouds = Clouds(read_truth(files.truth), read_cloud(files.cloud))
     results = [vehicle.read() for vehicle in vehicles]
-    found: dict[str | int, Scored] = {r.vehicle: Scored.of(clouds.score([r.pcd])) for r in results}
-    return found | {n: Scored.of(clouds.score([r.pcd for r in results[:n]])) for n in numbers}
+    found: dict[str | int, Scored] = {r.vehicle: Scored.of(clouds.score([r.pcd])) for r in results if r.pcd}
+    return found | {n: Scored.of(clouds.score([r.pcd for r in results[:n] if r.pcd])) for n in numbers}
 
 
 def target_single(found: Mapping[str, Any]) -> dict[str, float] | None:

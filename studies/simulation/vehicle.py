@@ -25,9 +25,9 @@ from gnd.vehicle_agent.segment import SegmentedScan
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 from studies.frame.pool import Tick
+from studies.pcd import PcdReport
 from studies.simulation.base_map import BaseMap, read_base
 from studies.simulation.baseline import CloudVehicle, read_cloud
-from studies.simulation.masses import VoxelWatch, Watcher
 from studies.simulation.options import MethodParameters, PoseSource
 from studies.simulation.poses import FromReference
 from studies.simulation.result import (
@@ -52,7 +52,6 @@ class VehicleTask:
         poses: where the poses come from.
         method: parameters of the vehicle.
         result: file to write, under `key`.
-        watch: voxels to write down scan by scan.
         recording: keep the drive in this MCAP file, too.
         cloud: the point-cloud baseline's map; None to run without it.
         rounded: whether new Gaussians are moved onto the lattice on which they travel, as the agent does; else the
@@ -68,7 +67,6 @@ class VehicleTask:
     method: MethodParameters
     result: Path
     key: str
-    watch: VoxelWatch | None = None
     recording: Path | None = None
     cloud: Path | None = None
     rounded: bool = True
@@ -114,7 +112,7 @@ def drive(
     pcd, pcd_bytes = run.pcd_report()
     stats = run.stats() | {"pcd_bytes": pcd_bytes, "cpu_s": round(process_time() - started_s, 2)}
     bodies, packed = tuple(report.body for report in reports), tuple(report.packed for report in reports)
-    return VehicleResult(task.drive.vehicle, task.sensor, bodies, row, evidence, stats, run.watched(), pcd, packed)
+    return VehicleResult(task.drive.vehicle, task.sensor, bodies, row, evidence, stats, pcd, packed)
 
 
 class _VehicleRun:
@@ -131,7 +129,6 @@ class _VehicleRun:
     ) -> None:
         (fix, self._items), method = first_fix(items, task.key), task.method
         self._labels = labels
-        self._watcher: Watcher | None = None
         self._cloud: CloudVehicle | None = None
         self.detector: RecordingDetector
         self._pipeline = Pipeline(
@@ -149,7 +146,6 @@ class _VehicleRun:
             ),
         )
         grid_frame = self._pipeline.local_map.grid_frame
-        self._watcher = Watcher(task.watch, base, grid_frame, method.detect) if task.watch else None
         self._cloud = CloudVehicle(read_cloud(task.cloud), grid_frame.frame) if task.cloud else None
         self._estimates: list[PoseEstimate] = []
         self._reference: list[ReferencePose] = []
@@ -171,20 +167,12 @@ class _VehicleRun:
     def _see(self, segmented: SegmentedScan) -> None:
         if self._labels is not None:
             self._labels.compare(segmented)
-        if self._watcher is not None:
-            self._watcher.add_scan(segmented)
         if self._cloud is not None:
             self._cloud.add_scan(segmented)
 
-    def watched(self) -> tuple[Any, Any]:
-        """What the watcher saw, empty without one."""
-        if self._watcher is None:
-            return np.zeros(0, np.int64), np.zeros((0, 0, 4), np.int32)
-        return self._watcher.history()
-
-    def pcd_report(self) -> tuple[bytes, Mapping[str, int]]:
+    def pcd_report(self) -> tuple[PcdReport | None, Mapping[str, int]]:
         """What the point-cloud baseline uploads, and its size by codec; nothing without it."""
-        return (b"", {}) if self._cloud is None else self._cloud.report()
+        return (None, {}) if self._cloud is None else self._cloud.report()
 
     def stats(self) -> dict[str, Any]:
         """Counts of the drive and errors of its poses."""

@@ -6,14 +6,13 @@ from typing import Final
 
 from gnd.fleet_sim.drives import DriveConfig
 from gnd.fleet_sim.street import StreetOptions, street
-from gnd.fleet_sim.truth import Truth, load_or_make_truth, read_truth, world_sha
+from gnd.fleet_sim.truth import Truth, load_or_make_truth, world_sha
 from gnd.fleet_sim.world import World, write_world
 from gnd.gnd_map.config import to_mapping
 from studies.frame.errors import FolderError
 from studies.frame.folder import StudyFolder
 from studies.frame.kept import SIMULATOR, key_of, sources_sha
 from studies.simulation.base_map import BaseMap, driven, read_base, surveyed, write_base
-from studies.simulation.masses import VoxelWatch, choose
 from studies.simulation.options import RunOptions, fleet_configs, fleet_sensors
 from studies.simulation.result import VoxelRows
 from studies.simulation.vehicle import VehicleTask
@@ -23,7 +22,7 @@ VEHICLE: Final = (
     *(f"vehicle_agent/{name}" for name in ("detect", "localise", "segment", "report.py", "packing.py", "tracks.py")),
     "vehicle_agent/tiles_at_hand.py",
     *(f"vehicle_agent/{name}.py" for name in ("local_map", "pipeline", "place", "scans", "surroundings")),
-    *(f"studies/simulation/{name}.py" for name in ("vehicle", "poses", "base_map", "masses")),
+    *(f"studies/simulation/{name}.py" for name in ("vehicle", "poses", "base_map")),
     *(f"studies/simulation/{name}.py" for name in ("streams", "result")),
 )
 """What a simulated vehicle's result depends on."""
@@ -137,12 +136,11 @@ def read_world_base(files: WorldFiles) -> BaseMap:
 
 def vehicle_tasks(options: RunOptions, seed: int, files: WorldFiles, keep_drives: bool = False) -> list[VehicleTask]:
     """Return the work of each vehicle of a world, in the order in which the fleet grows."""
-    base_sha, watch = read_world_base(files).sha, choose(read_truth(files.truth))
+    base_sha = read_world_base(files).sha
     sensors = fleet_sensors(options, seed)
     tasks = []
-    for index, (sensor, drive) in enumerate(zip(sensors, fleet_configs(options, seed), strict=True)):
-        watched = watch if index == _watching(sensors) else None
-        key = _key(options, files, base_sha, drive, watched)
+    for sensor, drive in zip(sensors, fleet_configs(options, seed), strict=True):
+        key = _key(options, files, base_sha, drive)
         name = f"{drive.vehicle}-{sensor}-{key}"
         tasks.append(
             VehicleTask(
@@ -155,7 +153,6 @@ def vehicle_tasks(options: RunOptions, seed: int, files: WorldFiles, keep_drives
                 method=options.method,
                 result=files.home / "vehicles" / f"{name}.npz",
                 key=key,
-                watch=watched,
                 recording=_recording(files, name) if keep_drives else None,
                 cloud=files.cloud if options.pcd else None,
                 rounded=options.upload != "float",
@@ -164,7 +161,7 @@ def vehicle_tasks(options: RunOptions, seed: int, files: WorldFiles, keep_drives
     return tasks
 
 
-def _key(options: RunOptions, files: WorldFiles, base_sha: str, drive: DriveConfig, watched: VoxelWatch | None) -> str:
+def _key(options: RunOptions, files: WorldFiles, base_sha: str, drive: DriveConfig) -> str:
     """A hash of everything that decides what the vehicle reports. How reports are merged is not among it."""
     method = options.method
     return key_of(
@@ -174,7 +171,6 @@ def _key(options: RunOptions, files: WorldFiles, base_sha: str, drive: DriveConf
         truth=sources_sha(SIMULATOR),
         drive=to_mapping(drive),
         poses=str(options.poses),
-        watch=watched,
         rounded=options.upload != "float",
         pcd=sources_sha(PCD) if options.pcd else None,
         method={name: to_mapping(getattr(method, name)) for name in ("localise", "segment", "detect", "report")},
@@ -185,11 +181,6 @@ def _recording(files: WorldFiles, name: str) -> Path:
     folder = files.home / "drives"
     folder.mkdir(exist_ok=True)
     return folder / f"{name}.mcap"
-
-
-def _watching(sensors: tuple[str, ...]) -> int:
-    """The vehicle whose masses are drawn: the first with an HDL-32E, else the first."""
-    return sensors.index("hdl32e") if "hdl32e" in sensors else 0
 
 
 def shots_a_second(task: VehicleTask) -> float:

@@ -1,63 +1,73 @@
-"""One drive along the motorway through SLAMCU, in one of the variants, and what the truth says of it."""
+"""One drive along the motorway through the pipeline of a vehicle without LiDAR, and what is true of its reports."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.cloud_merger.features import merge_layer
 from gnd.fleet_sim.roads.drive import RoadDrive
+from gnd.fleet_sim.roads.recording import items_of
 from gnd.fleet_sim.roads.route import FEATURE_STATES, MAP_ERROR_M, Route
-from gnd.fleet_sim.roads.sight import CameraView
 from gnd.fleet_sim.trajectory import gauss_markov
 from gnd.gnd_map.arrays import F64, I64
-from gnd.schemas.drive import Detections
-from gnd.vehicle_agent.features.look import Look, MapFeatures
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import Detections, DriveItem
+from gnd.schemas.feature_layer import LAYERS
+from gnd.schemas.features import FeatureChange, FeatureReport
+from gnd.vehicle_agent.config import PipelineParameters
+from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.features.layers import look_of
+from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
+from gnd.vehicle_agent.features.slamcu.replay import PoseAt
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
-from gnd.vehicle_agent.features.slamcu.watched import Lost, PoseAt, WatchedSlamcu
-from gnd.vehicle_agent.features.view import Occlusion, SensorView
-from studies.feature_study.truth import match_one_to_one, start_of
+from gnd.vehicle_agent.features.slamcu.watched import Lost
+from gnd.vehicle_agent.features.view import Occlusion
+from gnd.vehicle_agent.pipeline import Output
+from gnd.vehicle_agent.report.reporter import Identity
+from gnd.vehicle_agent.sources.recording import first_fix
+from studies.feature_study.pipelines import TilesAtOnce, found_in, in_route_frame, joined, reports_of, tiles_of
+from studies.feature_study.truth import match_one_to_one
 from studies.frame.pool import Tick
-from studies.slamcu_study.signs import DELETED, NEW, SignTruth, Verdicts
+from studies.slamcu_study.signs import DELETED, NEW, NORMAL, PAPER_LAMBDA_HD, MergedSigns, SignTruth, Verdicts
 
 LIDAR_SIGMA: Final = (0.04, 0.04, np.radians(0.08))
 """Errors of the LiDAR localiser's poses, m, m, rad: as `--poses noisy:4cm:0.08deg` of the other studies."""
 _LIDAR_TAU_S: Final = 2.0
 GIVEN_POSES: Final = ("no_rbpf", "lidar")
-_TELL_EVERY: Final = 200
+_OBSERVE_EVERY: Final = 50
+"""Looks: so often the masses of the signs are observed, long before a tile is decided and they are forgotten."""
+_SIGNS: Final = LAYERS["signs"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Driven:
-    """What SLAMCU says after a drive, and its poses.
+    """What a drive reports, and its poses in the route's frame.
 
     Attributes:
-        known: features of the map.
-        new: features that it has not; those with too little evidence, too.
+        reports: as the vehicle sends them; none of a variant that no vehicle drives.
+        changes: the reported change of each tile.
+        known: the newest that was observed of each sign of the map, with the masses over time.
+        new: features that the map has not, at the end of the drive.
         step_ms: float64 (S,), time of each look with the motion since the one before.
         look: int64 (S,), indices of the looks taken.
-        t_s: float64 (S,), time of the drive at each, since SLAMCU began.
-        pose: float64 (S, 3), after each, as the vehicle believes at the end.
-        pose_cov: float64 (S, 3, 3).
+        path: S poses, as the vehicle believes at the end.
         lost: stretches on which it had believed something else.
-        doubts: how often it asked.
-        hidden: looks at features of the map that were left out as hidden.
     """
 
-    known: tuple[KnownState, ...]
+    reports: Sequence[FeatureReport]
+    changes: Sequence[FeatureChange]
+    known: dict[int, KnownState]
     new: tuple[NewFeature, ...]
     step_ms: F64
     look: I64
-    t_s: F64
-    pose: F64
-    pose_cov: F64
-    lost: tuple[Lost, ...]
-    doubts: int
-    hidden: int
+    path: Sequence[PoseAt]
+    lost: Sequence[Lost]
 
 
 def sign_truth(route: Route) -> SignTruth:
@@ -67,202 +77,159 @@ def sign_truth(route: Route) -> SignTruth:
     return SignTruth(features.feature_id, features.xy_m, codes)
 
 
-def map_features(route: Route) -> MapFeatures:
-    """Return what the vehicle's map holds: normal and deleted signs where the survey put them."""
+def sign_tiles(route: Route) -> dict[TileId, FeatureTile]:
+    """Return the signs of the HD map, normal and deleted ones, as tiles."""
     mapped = route.features.mapped
-    n = len(mapped)
-    cov = np.broadcast_to(MAP_ERROR_M**2 * np.eye(2), (n, 2, 2)).copy()
-    return MapFeatures(mapped.feature_id, mapped.kinds, mapped.mapped_xy_m, mapped.height_m, cov)
+    return tiles_of(route.frame, mapped.feature_id, mapped.kinds, mapped.mapped_xy_m, MAP_ERROR_M)
 
 
-def look_of(detections: Detections) -> Look:
-    """Return a look for SLAMCU."""
-    return Look(
-        detections.t_ns,
-        np.asarray(detections.range_m, np.float64),
-        np.asarray(detections.bearing_rad, np.float64),
-        np.asarray(detections.sigma_range_m, np.float64),
-        np.asarray(detections.sigma_bearing_rad, np.float64),
-        detections.kinds,
-    )
-
-
-def sensor_view(view: CameraView) -> SensorView:
-    """Return a simulated sensor's field of view as the vehicle knows it."""
-    return SensorView(view.width_rad, view.range_m, float(view.rate_hz))
-
-
-def occlusion_of(drive: RoadDrive, look: int) -> Occlusion | None:
-    """Return what was in the way at a look; None where nothing was."""
-    free_m = drive.occluder_m[look]
-    if np.isinf(free_m).all():
-        return None
-    width = drive.view.width_rad
-    return Occlusion.of_ranges(free_m, -0.5 * width, width / len(free_m))
-
-
-def run_slamcu(drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int, tick: Tick) -> Driven:
-    """Return what SLAMCU makes of a drive.
+def driven_by(drive: RoadDrive, variant: str, vehicle: int, tick: Tick) -> Driven:
+    """Return what a drive along a motorway comes to.
 
     Args:
         drive: along a motorway.
         variant: of `VARIANTS`.
-        parameters: of SLAMCU.
-        seed: of its particles.
-        tick: told how many looks have been taken.
+        vehicle: its number, and the seed of its particles.
+        tick: called with the number of looks taken.
     """
-    run, start_ns = _SlamcuRun(drive, variant, parameters, seed), start_of(drive).t_ns
-    for t_ns, what, i in drive.events():
-        if t_ns > start_ns and what != "lanes":
-            run.take(t_ns, what, i)
-            if what == "look" and len(run.taken) % _TELL_EVERY == 0:
-                tick(i, len(drive.looks))
-    return run.driven()
+    if variant in GIVEN_POSES:
+        return _with_given_poses(drive, variant, vehicle)
+    camera = _camera(drive, vehicle)
+    tiles = TilesAtOnce({_SIGNS.name: sign_tiles(drive.route).values()})
+    items = items_of(drive) if variant != "no_occlusion" else map(_without_occlusion, items_of(drive))
+    return _CameraDrive(drive, camera, tiles).run(items, tick)
 
 
-class _SlamcuRun:
-    """SLAMCU on its way along a drive."""
-
-    def __init__(self, drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int) -> None:
-        start = start_of(drive)
-        self._drive, self._variant, self._view = drive, variant, sensor_view(drive.view)
-        first = map_features(drive.route), start.pose, start.cov, seed, drive.gnss.sigma_m
-        given = variant in GIVEN_POSES
-        self._given = Slamcu(parameters, *first) if given else None
-        self._watched = None if given else WatchedSlamcu(parameters, *first)
-        self._poses = _Poses.of(drive, variant, parameters, seed)
-        self._before_ns, self._spent_s = start.t_ns, 0.0
-        self._step_ms: list[float] = []
-        self._at: list[PoseAt] = []
-        self.taken: list[int] = []
-
-    def take(self, t_ns: int, what: str, i: int) -> None:
-        """Take one event; only SLAMCU's own work is timed."""
-        given = self._poses.at(t_ns, what, i) if self._poses is not None else None
-        if what == "look":
-            self._look(i, given)
-            return
-        begun_s = perf_counter()
-        if what == "motion":
-            self._slamcu.predict((t_ns - self._before_ns) * 1e-9, *motion_at(self._drive, i))
-            self._before_ns = t_ns
-        elif self._poses is None:
-            self._slamcu.gnss(*fix_at(self._drive, i))
-        self._spent_s += perf_counter() - begun_s
-
-    @property
-    def _slamcu(self) -> Slamcu | WatchedSlamcu:
-        found = self._given or self._watched
-        assert found is not None
-        return found
-
-    def _look(self, i: int, given: tuple[F64, F64] | None) -> None:
-        look = look_of(self._drive.looks[i])
-        occlusion = None if self._variant == "no_occlusion" else occlusion_of(self._drive, i)
-        begun_s = perf_counter()
-        if given is not None and self._given is not None:
-            self._given.set_pose(*given)
-        self._slamcu.look(look, self._view, occlusion)
-        self._step_ms.append(1e3 * (self._spent_s + perf_counter() - begun_s))
-        self._spent_s = 0.0
-        self.taken.append(i)
-        if self._given is not None:
-            self._at.append(PoseAt(self._given.now_s, *self._given.pose()))
-
-    def driven(self) -> Driven:
-        """What SLAMCU says at the end."""
-        watched = self._watched
-        if watched is not None:
-            watched.finish()
-        path = self._at if watched is None else watched.path
-        return Driven(
-            self._slamcu.known_states(),
-            self._slamcu.new_features(unclassified=True),
-            np.array(self._step_ms),
-            np.array(self.taken, np.int64),
-            np.array([one.t_s for one in path]),
-            np.array([one.pose for one in path]),
-            np.array([one.cov for one in path]),
-            () if watched is None else tuple(watched.lost),
-            0 if watched is None else watched.doubts,
-            self._slamcu.hidden,
-        )
+def _camera(drive: RoadDrive, vehicle: int) -> Identity:
+    return Identity(f"car-{vehicle}", drive.route.name, "none", _SIGNS.name)
 
 
-def motion_at(drive: RoadDrive, i: int) -> tuple[float, float]:
-    """Return wheel speed [m/s] and yaw rate [rad/s] of a sample."""
-    return float(drive.motion.speed_mps[i]), float(drive.motion.yaw_rate_radps[i])
+def _without_occlusion(item: DriveItem) -> DriveItem:
+    if not isinstance(item, Detections):
+        return item
+    return replace(item, free_m=np.empty(0, np.float32), free_field_rad=0.0)
 
 
-def fix_at(drive: RoadDrive, i: int) -> tuple[float, float, float]:
-    """Return x, y and sigma of a fix, m."""
-    return float(drive.gnss.xy_m[i, 0]), float(drive.gnss.xy_m[i, 1]), drive.gnss.sigma_m
+class _CameraDrive:
+    """A drive through `CameraPipeline`, which `gnd agent --localise-by slamcu` runs, observed on the way."""
+
+    def __init__(self, drive: RoadDrive, who: Identity, tiles: TilesAtOnce | None) -> None:
+        fix, _ = first_fix(items_of(drive), drive.route.name)
+        parameters = PipelineParameters(features=FeatureParameters((_SIGNS,)))
+        seed = int(who.vehicle.removeprefix("car-"))
+        self.pipeline = CameraPipeline(fix, parameters, who, feature_tiles=tiles, seed=seed)
+        self._drive, self._known = drive, dict[int, KnownState]()
+
+    def run(self, items: Iterator[DriveItem], tick: Tick) -> Driven:
+        """Drive to the end."""
+        pipeline, outputs, seen, spent_s = self.pipeline, list[Output](), 0, 0.0
+        step_ms, look = list[float](), list[int]()
+        for item in items:
+            begun_s = perf_counter()
+            outputs.append(pipeline.push(item))
+            spent_s += perf_counter() - begun_s
+            if not isinstance(item, Detections):
+                continue
+            seen += 1
+            if pipeline.slamcu is not None and len(pipeline.slamcu.path) > len(look):
+                look.append(seen - 1)
+                step_ms.append(1e3 * spent_s)
+            spent_s = 0.0
+            if seen % _OBSERVE_EVERY == 0:
+                self._observe()
+                tick(seen, len(self._drive.looks))
+        self._observe()
+        outputs.append(pipeline.finish())
+        slamcu = pipeline.slamcu
+        assert slamcu is not None, "the vehicle never found its first pose"
+        T = self._drive.route.frame.T_self_other(pipeline.place.frame)
+        new = tuple(replace(one, position_m=T[:2, :2] @ one.position_m + T[:2, 3]) for one in slamcu.new_features())
+        reports = reports_of(outputs)
+        changes = [change for report in reports for change in report.tiles]
+        path = [_moved(one, T) for one in slamcu.path]
+        return Driven(reports, changes, self._known, new, np.array(step_ms), np.array(look), path, slamcu.lost)
+
+    def _observe(self) -> None:
+        if self.pipeline.slamcu is not None:
+            self._known |= {one.feature_id: one for one in self.pipeline.slamcu.known_states()}
 
 
-class _Poses:
-    """Poses that are given to SLAMCU instead of being estimated by it."""
-
-    def __init__(self, drive: RoadDrive, filtered: Slamcu | None, error: F64) -> None:
-        self._drive, self._filtered, self._error = drive, filtered, error
-        self._before_ns = start_of(drive).t_ns
-
-    @classmethod
-    def of(cls, drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int) -> "_Poses | None":
-        if variant == "no_rbpf":
-            start = start_of(drive)
-            first = MapFeatures.none(), start.pose, start.cov, seed, drive.gnss.sigma_m
-            return cls(drive, Slamcu(parameters, *first), np.zeros((0, 3)))
-        if variant == "lidar":
-            rng = np.random.default_rng([seed, drive.seed, 61])
-            n, step_s = len(drive.looks), 1.0 / drive.view.rate_hz
-            error = [gauss_markov(rng, n, step_s, sigma, _LIDAR_TAU_S) for sigma in LIDAR_SIGMA]
-            return cls(drive, None, np.stack(error, axis=1))
-        return None
-
-    def at(self, t_ns: int, what: str, i: int) -> tuple[F64, F64] | None:
-        """Follow the drive; give pose and covariance at a look."""
-        if self._filtered is None:
-            if what != "look":
-                return None
-            return self._drive.truth.look_poses[i] + self._error[i], np.diag(np.square(LIDAR_SIGMA))
-        drive, filtered = self._drive, self._filtered
-        if what == "motion":
-            filtered.predict((t_ns - self._before_ns) * 1e-9, *motion_at(drive, i))
-            self._before_ns = t_ns
-        elif what == "gnss":
-            filtered.gnss(*fix_at(drive, i))
-        return filtered.pose() if what == "look" else None
+def _moved(one: PoseAt, T: F64) -> PoseAt:
+    """A pose in the frame of T (4, 4), which stands upright."""
+    R = np.eye(3)
+    R[:2, :2] = T[:2, :2]
+    return PoseAt(one.t_s, R @ one.pose + [*T[:2, 3], np.arctan2(T[1, 0], T[0, 0])], R @ one.cov @ R.T)
 
 
-def verdicts_of(
-    drive: RoadDrive, driven: Driven, map_confidence: float = SlamcuParameters().map_confidence
-) -> Verdicts:
-    """Return what a drive says of its signs, with what the truth tells of how it came about."""
-    truth = sign_truth(drive.route)
-    sign, t_s, masses = _traces(drive, driven, truth, map_confidence)
+def _with_given_poses(drive: RoadDrive, variant: str, vehicle: int) -> Driven:
+    """The signs as a vehicle judges them whose poses come from elsewhere: `FeatureLayer`, as behind the LiDAR."""
+    layer, route = FeatureLayer(_SIGNS, drive.route.frame), drive.route
+    for tile in sign_tiles(route).values():
+        layer.hold(tile)
+    poses = _lidar_poses(drive, vehicle) if variant == "lidar" else _blind_poses(drive, vehicle)
+    looks = [item for item in items_of(drive) if isinstance(item, Detections)]
+    step_ms = []
+    for i, at in poses.items():
+        begun_s, rows = perf_counter(), np.arange(len(looks[i].kinds))
+        placed = PlacedLook(look_of(looks[i], rows, np.eye(4)), at.pose, at.cov, 0.0)
+        layer.see(placed, Occlusion.of_look(looks[i]))
+        step_ms.append(1e3 * (perf_counter() - begun_s))
+    return Driven((), layer.leave_all(), {}, (), np.array(step_ms), np.array(list(poses)), list(poses.values()), ())
+
+
+def _lidar_poses(drive: RoadDrive, vehicle: int) -> dict[int, PoseAt]:
+    rng = np.random.default_rng([vehicle, drive.seed, 61])
+    n, step_s = len(drive.looks), 1.0 / drive.view.rate_hz
+    error = np.stack([gauss_markov(rng, n, step_s, sigma, _LIDAR_TAU_S) for sigma in LIDAR_SIGMA], axis=1)
+    cov = np.diag(np.square(LIDAR_SIGMA))
+    return {i: PoseAt(i * step_s, pose, cov) for i, pose in enumerate(drive.truth.look_poses + error)}
+
+
+def _blind_poses(drive: RoadDrive, vehicle: int) -> dict[int, PoseAt]:
+    """The poses of a pipeline whose camera sees nothing: wheels, gyro and GNSS alone."""
+    blind = _CameraDrive(drive, _camera(drive, vehicle), None)
+    driven = blind.run((_seeing_nothing(item) for item in items_of(drive)), lambda *_: None)
+    return dict(zip(driven.look.tolist(), driven.path, strict=True))
+
+
+def _seeing_nothing(item: DriveItem) -> DriveItem:
+    if not isinstance(item, Detections):
+        return item
+    none = item.range_m[:0]
+    return replace(
+        item, kinds=(), range_m=none, bearing_rad=none, height_m=none, sigma_range_m=none, sigma_bearing_rad=none
+    )
+
+
+def verdicts_of(drive: RoadDrive, driven: Driven) -> Verdicts:
+    """Return a drive's verdicts on the signs by its reports, and what the truth adds to them.
+
+    A sign of the map that no report mentions stays on the map: it counts as normal.
+    """
+    truth, frame = sign_truth(drive.route), drive.route.frame
+    seen = [one for change in driven.changes for one in change.seen]
+    absent = {one.feature_id for one in seen if one.existence.absent > one.existence.exist}
+    known = drive.route.features.mapped.feature_id
+    new_xy_m, new_cov_m2 = found_in(frame, driven.changes)
+    pose, cov = np.array([one.pose for one in driven.path]), np.array([one.cov for one in driven.path])
+    true = drive.truth.look_poses[driven.look]
     in_view, hidden = drive.truth.in_view[driven.look], drive.truth.hidden[driven.look]
-    new = driven.new
+    sign, masses = _traces(driven, truth)
     return Verdicts(
-        known_id=np.array([one.feature_id for one in driven.known], np.int64),
-        known_predicted=np.array([int(one.feature_class) for one in driven.known], np.uint8),
-        known_conflict=np.array([one.existence.conflict for one in driven.known]),
-        new_xy_m=np.array([one.position_m for one in new]).reshape(-1, 2),
-        new_cov_m2=np.array([one.cov_m2 for one in new]).reshape(-1, 2, 2),
-        new_exists=np.array([one.feature_class == NEW for one in new], np.bool_),
-        new_conflict=np.array([one.existence.conflict for one in new]),
+        known_id=known,
+        known_predicted=np.array([DELETED if one in absent else NORMAL for one in known.tolist()], np.uint8),
+        new_xy_m=new_xy_m,
+        new_cov_m2=new_cov_m2,
         step_ms=driven.step_ms,
-        pose_error=pose_errors(driven.pose, drive.truth.look_poses[driven.look]),
-        pose_chi2=pose_chi2(driven.pose, driven.pose_cov, drive.truth.look_poses[driven.look]),
-        pose_said_lost=said_lost(driven),
+        pose_error=pose_errors(pose, true),
+        pose_chi2=pose_chi2(pose, cov, true),
+        pose_given_up=given_up(driven),
         lost=np.array(
-            [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.told_anew) for one in driven.lost]
+            [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.replayed) for one in driven.lost]
         ).reshape(-1, 6),
-        pose_part_m=pose_parts(driven.pose, drive.truth.look_poses[driven.look], truth.xy_m, in_view & ~hidden),
         visible=(in_view & ~hidden).sum(axis=0).astype(np.int64),
         occluded=(in_view & hidden).sum(axis=0).astype(np.int64),
-        no_evidence=driven.hidden,
         trace_sign=sign,
-        trace_s=t_s,
         trace_masses=masses,
     )
 
@@ -281,63 +248,44 @@ def pose_chi2(pose: F64, cov: F64, true: F64) -> F64:
     return np.asarray(np.einsum("si,si->s", off, np.linalg.solve(cov[:, :2, :2], off[..., None])[..., 0]))
 
 
-def said_lost(driven: Driven) -> NDArray[np.bool_]:
-    """Return bool (S,), the looks of stretches of which the vehicle says nothing."""
-    lost = np.zeros(len(driven.look), np.bool_)
+def given_up(driven: Driven) -> NDArray[np.bool_]:
+    """Return bool (S,), the looks of stretches that the vehicle has given up."""
+    t_s, lost = np.array([one.t_s for one in driven.path]), np.zeros(len(driven.path), np.bool_)
     for one in driven.lost:
-        lost |= (driven.t_s >= one.from_s) & (driven.t_s <= one.until_s) & (not one.told_anew)
+        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.replayed)
     return lost
 
 
-def pose_parts(pose: F64, true: F64, xy_m: F64, visible: np.ndarray[tuple[int, int], np.dtype[np.bool_]]) -> F64:
-    """Return (N, 2) what errors of the poses moved each place by, mean over the looks at it; nan where there are none.
-
-    A look from near tells more of a place than one from afar, and so counts with the inverse of its squared range.
-
-    Args:
-        pose: (S, 3) as estimated.
-        true: (S, 3).
-        xy_m: (N, 2) places.
-        visible: (S, N) which looks could see which place.
-    """
-    found = np.full((len(xy_m), 2), np.nan)
-    for n, place in enumerate(xy_m):
-        rows = np.flatnonzero(visible[:, n])
-        if len(rows):
-            moved = _seen_from(pose[rows], true[rows], place) - place
-            weight = 1.0 / np.maximum(np.linalg.norm(place - true[rows, :2], axis=1), 10.0) ** 2
-            found[n] = weight @ moved / weight.sum()
-    return found
-
-
-def _seen_from(pose: F64, true: F64, place: F64) -> F64:
-    """Where a place (2,) seen rightly from true poses (S, 3) lies for one who believes to be at other poses."""
-    turn = pose[:, 2] - true[:, 2]
-    c, s = np.cos(turn), np.sin(turn)
-    x, y = (place - true[:, :2]).T
-    return np.asarray(pose[:, :2] + np.column_stack([c * x - s * y, s * x + c * y]))
-
-
-def _traces(drive: RoadDrive, driven: Driven, truth: SignTruth, map_confidence: float) -> tuple[I64, F64, F64]:
-    """Masses over time of deleted and new signs, those of the map from λ_HD on: sign, seconds, masses (Q, 3)."""
-    begin_ns, rows = int(drive.motion.t_ns[0]), []
-    for sign, one in _told(driven, truth):
+def _traces(driven: Driven, truth: SignTruth) -> tuple[I64, F64]:
+    """Masses over time of deleted and new signs, those of the map from λ_HD on: sign (Q,), masses (Q, 3)."""
+    rows = []
+    for sign, one in _observed(driven, truth):
         if isinstance(one, KnownState) and one.history:
-            rows.append((sign, (one.history[0].t_ns - begin_ns) * 1e-9, map_confidence, 0.0, 1.0 - map_confidence))
-        for step in one.history:
-            masses = step.existence
-            rows.append((sign, (step.t_ns - begin_ns) * 1e-9, masses.exist, masses.absent, masses.unknown))
-    columns = np.array(rows, np.float64).reshape(-1, 5)
-    return columns[:, 0].astype(np.int64), columns[:, 1], columns[:, 2:]
+            rows.append((sign, PAPER_LAMBDA_HD, 0.0, 1.0 - PAPER_LAMBDA_HD))
+        rows += [(sign, at.existence.exist, at.existence.absent, at.existence.unknown) for at in one.history]
+    columns = np.array(rows, np.float64).reshape(-1, 4)
+    return columns[:, 0].astype(np.int64), columns[:, 1:]
 
 
-def _told(driven: Driven, truth: SignTruth) -> Iterator[tuple[int, KnownState | NewFeature]]:
-    """Deleted and new signs with what SLAMCU says of them."""
-    states = {one.feature_id: one for one in driven.known}
+def _observed(driven: Driven, truth: SignTruth) -> Iterator[tuple[int, KnownState | NewFeature]]:
+    """Deleted and new signs with what was observed of them."""
     for sign in truth.of(DELETED).tolist():
-        yield sign, states[int(truth.feature_id[sign])]
+        if int(truth.feature_id[sign]) in driven.known:
+            yield sign, driven.known[int(truth.feature_id[sign])]
     signs = truth.of(NEW)
-    new = [one for one in driven.new if one.feature_class == NEW]
-    matching = match_one_to_one(np.array([one.position_m for one in new]).reshape(-1, 2), truth.xy_m[signs])
+    matching = match_one_to_one(np.array([one.position_m for one in driven.new]).reshape(-1, 2), truth.xy_m[signs])
     for sign, estimate in zip(signs[matching.true].tolist(), matching.estimate.tolist(), strict=True):
-        yield sign, new[estimate]
+        yield sign, driven.new[estimate]
+
+
+def merged_signs(route: Route, reports: Sequence[FeatureReport]) -> MergedSigns:
+    """Return what the cloud publishes."""
+    base = {tile: one.features for tile, one in sign_tiles(route).items()}
+    before = {one.feature_id for features in base.values() for one in features}
+    merged = {tile: one.features for tile, one in merge_layer(base, reports).items()}
+    known = sorted(one.feature_id for features in merged.values() for one in features if one.feature_id in before)
+    places = joined(
+        in_route_frame(route.frame, tile, [(f.position_m, f.cov_m2) for f in features if f.feature_id not in before])
+        for tile, features in merged.items()
+    )
+    return MergedSigns(np.array(known, np.int64), *places)

@@ -1,4 +1,4 @@
-"""The figures of the SLAMCU paper on our routes: masses over time (Figure 8), Table 1, position errors (Figure 9)."""
+"""The figures of the SLAMCU paper on our routes: masses over time (Figure 8), position errors (Figure 9)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from gnd.gnd_map.arrays import F64, I64
 from studies.frame.figures import BLUE, GREY, INK, MAGENTA, ORANGE, RED, dress, finish, new_figure
 from studies.slamcu_study import signs as reference
-from studies.slamcu_study.scores import SignScore, accuracy_of, merged_score, scored_drive
+from studies.slamcu_study.scores import SignScore, merged_score, scored_drive
 from studies.slamcu_study.signs import ABSENT, DELETED, EXIST, NEW, SignTruth, SlamcuSeed, Verdicts
 
 _MASSES: Final = (("m(∃) exists", BLUE), ("m(∄) does not", RED), ("m(Ω) unknown", GREY))
@@ -28,7 +28,6 @@ def draw_figures(outcomes: Sequence[SlamcuSeed], km: float, folder: Path) -> lis
     note = f"seed {first.seed}, {km:g} km of motorway"
     return [
         draw_masses(first.first, first.truth, note, folder / "slamcu_masses.png"),
-        draw_confusion(outcomes, folder / "slamcu_confusion.png"),
         draw_positions(first, note, folder / "slamcu_position_errors.png"),
     ]
 
@@ -80,35 +79,6 @@ def most_telling(found: Verdicts, signs: I64, right: int) -> int | None:
         if best is None or rank < best[0]:
             best = (rank, sign)
     return None if best is None else best[1]
-
-
-def draw_confusion(outcomes: Sequence[SlamcuSeed], path: Path) -> Path:
-    """Draw Table 1 as a picture: ours, the mean of the seeds, beside the paper's."""
-    ours = np.mean([scored_drive(one.first, one.truth).confusion for one in outcomes], axis=0)
-    figure = new_figure(10.6, 4.0)
-    seeds = ", ".join(str(one.seed) for one in outcomes)
-    titles = ("ours", "the paper's Table 1")
-    matrices = (ours, np.array(reference.PAPER_CONFUSION, np.float64))
-    for axes, title, matrix in zip(figure.subplots(1, 2), titles, matrices, strict=True):
-        overall = accuracy_of(matrix)["overall"]
-        _matrix(axes, matrix, f"{title}: {overall:.2f} % right" if overall is not None else title)
-    return finish(figure, "Classification of signs, one drive", f"mean of seed {seeds}", path)
-
-
-def _matrix(axes: Axes, matrix: F64, title: str) -> None:
-    shares = matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
-    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.15, aspect="auto")
-    for (row, column), value in np.ndenumerate(matrix):
-        colour = "white" if shares[row, column] > 0.6 else INK
-        axes.text(column, row, f"{value:.4g}", ha="center", va="center", color=colour, fontsize=13)
-    axes.set_xticks(range(len(reference.PREDICTED)), reference.PREDICTED)
-    axes.set_yticks(range(len(reference.TRUE_CLASSES)), reference.TRUE_CLASSES)
-    axes.set_xlabel("predicted", color=INK)
-    axes.set_ylabel("true", color=INK)
-    axes.set_title(title, loc="left", fontsize=11, weight="bold", color=INK)
-    axes.tick_params(length=0, colors=INK)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
 
 
 def draw_positions(outcome: SlamcuSeed, note: str, path: Path) -> Path:

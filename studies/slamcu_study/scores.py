@@ -77,13 +77,13 @@ def score(
     new: tuple[F64, F64],
     radius_m: float = RADIUS_M,
 ) -> SignScore:
-    """Return how well a drive, or a map, tells the signs.
+    """Return how well a drive, or a map, classifies and places the signs.
 
     Args:
         truth: all signs of the route.
         known: feature ids (K,) of the signs of the map that was driven with, and their classes (K,), indices of
             `PREDICTED`.
-        new: positions (J, 2) [m] and covariances (J, 2, 2) [m^2] of those new features that are said to exist.
+        new: positions (J, 2) [m] and covariances (J, 2, 2) [m^2] of the new features that are reported.
         radius_m: the farthest an estimate may lie from its sign.
     """
     confusion = np.zeros((len(TRUE_CLASSES), len(PREDICTED)), np.int64)
@@ -109,9 +109,9 @@ def _placed(
 
 
 def _predicted(feature_ids: I64, known_id: I64, predicted: U8) -> I64:
-    """(N,) what the drive says of signs of the map; unclassified what it does not mention."""
-    said = dict(zip(known_id.tolist(), predicted.tolist(), strict=True))
-    return np.array([said.get(one, UNCLASSIFIED) for one in feature_ids.tolist()], np.int64)
+    """(N,) the class of signs of the map by the drive; unclassified what it does not mention."""
+    by_id = dict(zip(known_id.tolist(), predicted.tolist(), strict=True))
+    return np.array([by_id.get(one, UNCLASSIFIED) for one in feature_ids.tolist()], np.int64)
 
 
 def _near(xy_m: F64, others_m: F64, radius_m: float) -> int:
@@ -181,7 +181,7 @@ def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
         "accuracy": accuracy_of(scored.confusion),
         "accuracy_visible": accuracy_of(scored_drive(found, truth.take(found.visible > 0)).confusion),
         "confusion": scored.confusion.tolist(),
-        "position_error_m": scored.plain_errors() | parts_of_errors(scored, found) | {"nees": _nees(scored)},
+        "position_error_m": scored.plain_errors() | {"nees": _nees(scored)},
         "false_new": {"all": len(scored.false_new), "near_a_sign_of_the_map": scored.near_known},
         "step_ms_median": float(np.median(found.step_ms)),
         "step_ms_p95": float(np.quantile(found.step_ms, 0.95)),
@@ -190,44 +190,25 @@ def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
         "pose_nees": float(found.pose_chi2.mean()),
         "lost": _lost(found),
         "lost_without_knowing": lost_without_knowing(found),
-        "conflict": _conflict(found),
         "looks": {
             "visible": int(found.visible.sum()),
             "occluded": int(found.occluded.sum()),
-            "no_evidence": int(found.no_evidence),
             "signs_never_visible": int(np.count_nonzero(found.visible == 0)),
             "new_signs_never_visible": int(np.count_nonzero(found.visible[truth.of(NEW)] == 0)),
         },
     }
 
 
-def scored_new(found: Verdicts) -> tuple[F64, F64]:
-    """Return positions and covariances of the new features that a drive says exist."""
-    return found.new_xy_m[found.new_exists], found.new_cov_m2[found.new_exists]
-
-
 def scored_drive(found: Verdicts, truth: SignTruth) -> SignScore:
-    """Return how well a drive tells the signs."""
-    return score(truth, (found.known_id, found.known_predicted), scored_new(found))
+    """Return how well a drive classifies and places the signs."""
+    return score(truth, (found.known_id, found.known_predicted), (found.new_xy_m, found.new_cov_m2))
 
 
 def merged_score(merged: MergedSigns, truth: SignTruth) -> SignScore:
-    """Return how well a published layer tells the signs: what it holds exists, what it no longer holds is deleted."""
+    """Return how well a published layer has the signs: what it holds exists, what it no longer holds is deleted."""
     ids = truth.feature_id[truth.true_class != NEW]
-    said = np.where(np.isin(ids, merged.known_id), NORMAL, DELETED).astype(np.uint8)
-    return score(truth, (ids, said), (merged.new_xy_m, merged.new_cov_m2))
-
-
-def parts_of_errors(scored: SignScore, found: Verdicts) -> dict[str, Any]:
-    """Return mean lengths of what the pose moved each new sign by, and of the rest, which is the measurements'."""
-    pose = found.pose_part_m[scored.sign]
-    rest = scored.error_m - pose
-    seen = np.isfinite(pose).all(axis=1)
-    return {f"{name}_part": _mean_length(part[seen]) for name, part in (("pose", pose), ("measurement", rest))}
-
-
-def _mean_length(vectors: F64) -> float | None:
-    return float(np.linalg.norm(vectors, axis=1).mean()) if len(vectors) else None
+    predicted = np.where(np.isin(ids, merged.known_id), NORMAL, DELETED).astype(np.uint8)
+    return score(truth, (ids, predicted), (merged.new_xy_m, merged.new_cov_m2))
 
 
 def _nees(scored: SignScore) -> dict[str, Any] | None:
@@ -241,24 +222,24 @@ def _pose_rmse(found: Verdicts) -> dict[str, float]:
 
 def lost_without_knowing(found: Verdicts) -> int:
     """Return on how many stretches of `LOST_LOOKS` looks or more the vehicle was `LOST_M` off, far beyond what it
-    claims (χ² of 2 degrees of freedom, 99.9 %), and does not say that it was lost.
+    claims (χ² of 2 degrees of freedom, 99.9 %), and has not given the stretch up.
 
     Poses are those that it believes in at the end, which its reports rest on.
     """
     off = np.hypot(*found.pose_error[:, :2].T) > LOST_M
-    wrong = off & (found.pose_chi2 > LOST_CHI2) & ~found.pose_said_lost
+    wrong = off & (found.pose_chi2 > LOST_CHI2) & ~found.pose_given_up
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(np.int8)))
     return int(np.count_nonzero(edges[1::2] - edges[::2] >= LOST_LOOKS))
 
 
 def _lost(found: Verdicts) -> dict[str, float]:
-    """What the vehicle itself says of where it was lost: stretches, of these told anew, and what it took back."""
+    """Stretches on which the vehicle found itself lost, how many of them it estimated anew, and verdicts taken back."""
     stretches = {"stretches": len(found.lost), "told_anew": float(found.lost[:, 5].sum())}
     return stretches | {
         "off_m_max": float(found.lost[:, 2].max(initial=0.0)),
         "seconds": float((found.lost[:, 1] - found.lost[:, 0]).sum()),
         "taken_back": float(found.lost[:, 4].sum()),
-        "share_given_up": float(found.pose_said_lost.mean()),
+        "share_given_up": float(found.pose_given_up.mean()),
     }
 
 
@@ -271,19 +252,6 @@ def worst_of(seeds: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "lost": sum(one["lost"]["stretches"] > 0 for one in seeds.values()),
         "lost_without_knowing": sum(one["lost_without_knowing"] > 0 for one in seeds.values()),
         "drives": len(seeds),
-    }
-
-
-def _conflict(found: Verdicts) -> dict[str, float]:
-    """How much was thrown away by Dempster's normalisation, over the signs of the map and the new features."""
-    conflict = np.concatenate([found.known_conflict, found.new_conflict])
-    if not len(conflict):
-        return {}
-    return {
-        "mean": float(conflict.mean()),
-        "p95": float(np.quantile(conflict, 0.95)),
-        "max": float(conflict.max()),
-        "share_above_half": float(np.mean(conflict > 0.5)),
     }
 
 
@@ -309,7 +277,6 @@ _ERRORS: Final = {
 _ABLATION: Final = {
     **{f"{name} %": f"{{accuracy.{name}:.2f}}" for name in (*TRUE_CLASSES, "overall")},
     "new signs, m": "{position_error_m.mean:.3f}",
-    "of the pose": "{position_error_m.pose_part:.3f}",
     "missed": "{position_error_m.missed:.4g}",
     "false": "{position_error_m.false:.4g}",
     "pose along / across, m": "{pose_rmse.longitudinal_m:.2f} / {pose_rmse.lateral_m:.2f}",
@@ -319,9 +286,7 @@ _FACTS: Final = {
     "NEES of the place (2 expected)": "{pose_nees:.2f}",
     "one step: median / 95 %": "{step_ms_median:.2f} / {step_ms_p95:.2f} ms",
     "looks at signs: visible / hidden": "{looks.visible:.0f} / {looks.occluded:.0f}",
-    "looks at signs of the map that gave no evidence": "{looks.no_evidence:.0f}",
     "signs never visible / new ones of them": "{looks.signs_never_visible:.4g} / {looks.new_signs_never_visible:.4g}",
-    "conflict: mean / 95 % / largest": "{conflict.mean:.3f} / {conflict.p95:.3f} / {conflict.max:.3f}",
     "NEES of new signs (2 expected) / within their 95 %": (
         "{position_error_m.nees.mean:.2f} / {position_error_m.nees.within_95:.0%}"
     ),
@@ -365,6 +330,5 @@ def _facts(found: Found, ours: Found) -> Sheet:
     table.add("drives that found they had been lost", shown("{lost} of {drives}", found))
     table.add("drives lost without knowing", shown("{lost_without_knowing} of {drives}", found))
     for name, cell in _FACTS.items():
-        if not (name.startswith("conflict") and not ours["conflict"]):
-            table.add(name, shown(cell, ours))
+        table.add(name, shown(cell, ours))
     return table

@@ -75,49 +75,36 @@ class SignTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdicts:
-    """What one drive says, and how it came about. K signs of its map, J new features, N true signs, S steps, Q points.
+    """What one drive reports, and how it came about: K signs of its map, J new ones, N true signs, S steps, Q points.
 
     Attributes:
         known_id: int64 (K,).
         known_predicted: uint8 (K,), index of `PREDICTED`.
-        known_conflict: float64 (K,), share of the masses that Dempster's normalisation threw away.
         new_xy_m: float64 (J, 2), map frame.
         new_cov_m2: float64 (J, 2, 2).
-        new_exists: bool (J,), whether the drive says that the feature is there; else it has too little evidence.
-        new_conflict: float64 (J,).
         step_ms: float64 (S,), time of each step.
         pose_error: float64 (S, 3), along and across the true heading [m], heading [rad].
         pose_chi2: float64 (S,), squared Mahalanobis distance of the place from the true one, 2 degrees of freedom.
-        pose_said_lost: bool (S,), looks of a stretch of which the vehicle says nothing, for it was lost.
-        lost: float64 (L, 6), stretches that it found to have told wrong: from, until [s], off [m], statistic of the
-            test that failed, verdicts taken back, whether it told the stretch anew.
-        pose_part_m: float64 (N, 2), what the error of the pose moved each sign by, mean over the looks at it [m]; nan
-            for signs never looked at.
+        pose_given_up: bool (S,), looks of stretches that the vehicle has given up.
+        lost: float64 (L, 6), stretches on which it found itself lost: from, until [s], off [m], statistic of the
+            test that failed, verdicts taken back, whether the stretch was estimated anew.
         visible, occluded: int64 (N,), looks at each sign that was in view, free and hidden.
-        no_evidence: looks at signs of the map that were left out as hidden.
-        trace_sign: int64 (Q,), index of the true sign whose masses are told; only of deleted and new signs.
-        trace_s: float64 (Q,), seconds since the drive began.
+        trace_sign: int64 (Q,), index of the true sign whose masses these are; only of deleted and new signs.
         trace_masses: float64 (Q, 3), exist, absent, unknown.
     """
 
     known_id: I64
     known_predicted: U8
-    known_conflict: F64
     new_xy_m: F64
     new_cov_m2: F64
-    new_exists: NDArray[np.bool_]
-    new_conflict: F64
     step_ms: F64
     pose_error: F64
     pose_chi2: F64
-    pose_said_lost: NDArray[np.bool_]
+    pose_given_up: NDArray[np.bool_]
     lost: F64
-    pose_part_m: F64
     visible: I64
     occluded: I64
-    no_evidence: int
     trace_sign: I64
-    trace_s: F64
     trace_masses: F64
 
 
@@ -143,8 +130,8 @@ class SlamcuSeed:
     Attributes:
         seed: of the route.
         truth: its signs.
-        variants: what the first vehicle says, by variant.
-        drives: what each vehicle says; the first as in `variants`.
+        variants: verdicts of the first vehicle, by variant.
+        drives: verdicts of each vehicle; the first as in `variants`.
         merged: by number of vehicles.
     """
 

@@ -8,22 +8,20 @@ from typing import Final
 from gnd.fleet_sim.drives import EPOCH_NS
 from gnd.fleet_sim.roads.drive import RoadDriveOptions, drive_route
 from gnd.fleet_sim.roads.motorway import motorway
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from studies.feature_study.reporting import read_reports, write_reports
+from studies.feature_study.pipelines import read_reports, write_reports
 from studies.frame.command import Bench, StudyReport, study
 from studies.frame.kept import Kept, key_of, sources_sha
 from studies.frame.options import check, option, seeds
 from studies.frame.pool import Job, Tick
-from studies.slamcu_study.driving import run_slamcu, sign_truth, verdicts_of
+from studies.slamcu_study.driving import driven_by, merged_signs, sign_truth, verdicts_of
 from studies.slamcu_study.faults import FAULTS, with_faults
-from studies.slamcu_study.merging import merged_signs, sign_reports
 from studies.slamcu_study.scores import summary_of, tables_of
 from studies.slamcu_study.signs import FULL, VARIANTS, MergedSigns, SignTruth, SlamcuSeed, Verdicts
 
 SOURCES: Final = (
-    *("fleet_sim/roads", "fleet_sim/drives.py", "gnd_map", "schemas", "vehicle_agent/features"),
+    *("fleet_sim/roads", "fleet_sim/drives.py", "gnd_map", "schemas", "vehicle_agent"),
     "studies/feature_study",
-    *(f"studies/slamcu_study/{name}.py" for name in ("driving", "faults", "merging", "signs")),
+    *(f"studies/slamcu_study/{name}.py" for name in ("driving", "faults", "signs")),
 )
 """What a drive's result depends on."""
 _HOUR_NS: Final = 3_600 * 1_000_000_000
@@ -92,7 +90,7 @@ class DriveTask:
 
     @property
     def verdicts(self) -> Kept:
-        """Where what it says is kept, with the truth."""
+        """Where its verdicts are kept, with the truth."""
         return self._kept("verdicts")
 
     @property
@@ -112,7 +110,7 @@ class DriveTask:
 
     @property
     def name(self) -> str:
-        """What the progress bar says."""
+        """Its name in the progress bar."""
         return f"seed {self.seed}, car {self.vehicle}" + ("" if self.variant == FULL else f", {self.variant}")
 
 
@@ -126,11 +124,11 @@ def tasks_of(options: SlamcuOptions, seed: int, root: Path) -> list[DriveTask]:
 
 def run_drive(task: DriveTask, tick: Tick) -> None:
     """Drive, classify, report; runs in a worker process."""
-    route, parameters = motorway(task.seed, 1e3 * task.km), SlamcuParameters()
+    route = motorway(task.seed, 1e3 * task.km)
     drive = drive_route(route, task.vehicle, RoadDriveOptions(start_ns=EPOCH_NS + task.vehicle * _HOUR_NS))
     drive = with_faults(drive, task.faults, task.seed)
-    driven = run_slamcu(drive, task.variant, parameters, task.vehicle, tick)
-    write_reports(sign_reports(drive, driven, task.vehicle, parameters), task.reports)
+    driven = driven_by(drive, task.variant, task.vehicle, tick)
+    write_reports(driven.reports, task.reports)
     task.verdicts.write((verdicts_of(drive, driven), sign_truth(route)))
 
 

@@ -136,8 +136,7 @@ def _steps(scene: Scene) -> Trajectory:
     for item in scene.drive:
         if isinstance(item, MotionSample):
             motion.push(item.t_ns, item.speed_mps, item.yaw_rate_radps)
-    teacher = MotionTeacher(motion, parameters.odometry)
-    odometry = ScanOdometry(parameters.scan_odometry, parameters.registration.noise_m)
+    teacher, odometry = MotionTeacher(motion), ScanOdometry()
     T, times_ns, poses = np.eye(4), list[int](), list[F64]()
     for scan in scene.drive:
         if not isinstance(scan, Scan):

@@ -25,7 +25,7 @@ from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
 from gnd.vehicle_agent.link.download import DOWNLOAD_BATCH_S
 from gnd.vehicle_agent.link.plan import VehicleCourse, batch_bytes, needs
-from gnd.vehicle_agent.surroundings import STEP_M, tiles_along
+from gnd.vehicle_agent.surroundings import AHEAD_S, STEP_M, tiles_along
 from studies.traffic_study.fleet import drive_config
 from studies.traffic_study.options import TrafficOptions
 
@@ -133,7 +133,7 @@ def _due(track: DownloadTrack, k: int, parameters: DownloadParameters, known: se
     here, velocity = track.position_m[k], track.velocity_mps[k]
     speed = float(np.hypot(*velocity))
     heading = float(np.arctan2(velocity[1], velocity[0]))
-    ahead_m = max(parameters.ahead_m, parameters.ahead_s * speed)
+    ahead_m = max(parameters.ahead_m, AHEAD_S * speed)
     end = here + ahead_m * np.array([np.cos(heading), np.sin(heading), 0.0])
     tiles = tiles_along(track.frame, np.stack([here, end]), parameters.near_m)
     planned = needs(

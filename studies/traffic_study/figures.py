@@ -12,7 +12,6 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from gnd.gnd_map.arrays import F64
 from studies.frame.figures import INK, PALE, save, spines
-from studies.traffic_study.summary import UPLOADS
 
 _LINKS: Final = {"3g": "#2f6fb5", "4g": "#e08a1e", "5g": "#d9b310"}
 """As in the paper: blue, orange, yellow."""
@@ -38,12 +37,12 @@ class Note:
 
 
 def draw_figures(found: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Draw (a) the download, (b) the upload of one drive, (c) that of all drives, and return their paths.
+    """Draw (a) the download and (c) the upload of all drives, and return their paths.
 
     Raises:
         SimError: a file cannot be written.
     """
-    pictures = (("download.png", _download), ("upload_single.png", _single), ("upload_fleet.png", _fleet))
+    pictures = (("download.png", _download), ("upload_fleet.png", _fleet))
     for name, draw in pictures:
         figure = Figure(figsize=(9.6, 5.6), dpi=130, facecolor="white", layout="constrained")
         draw(figure.add_subplot(), found)
@@ -73,32 +72,6 @@ def _links(axes: Axes, x: F64, sizes: Mapping[str, F64]) -> list[Note]:
     for name, y in sizes.items():
         axes.plot(x, y, color=_LINKS[name], linewidth=1.6, linestyle="--", zorder=2)
     return [Note(y[-1], f"{name.upper()} carries {_shown(y[-1])}", _LINKS[name]) for name, y in sizes.items()]
-
-
-def _single(axes: Axes, found: Mapping[str, Any]) -> None:
-    """Bars of one drive's upload; lines where the links end."""
-    up = found["upload"]
-    bars = [(label, up["single"][name]["bytes"], _COLOURS[name]) for name, label in UPLOADS]
-    bars.append(("GND changes, world merged", _steady_bytes(found), "#7cc79b"))
-    shown = [bar for bar in bars if bar[1]]
-    for row, (_, size, colour) in enumerate(shown):
-        axes.barh(row, size, color=colour, height=0.62, zorder=3)
-        axes.text(size * 1.15, row, _shown(size), va="center", color=INK, fontsize=9, zorder=5, backgroundcolor="white")
-    axes.set_yticks(range(len(shown)), [label for label, *_ in shown])
-    axes.set_ylim(len(shown) - 0.5, -0.9)
-    for side, (name, colour) in zip(("right", "right", "left"), _LINKS.items(), strict=True):
-        size = found["links"][name]["up_bytes"]
-        axes.axvline(size, color=colour, linewidth=1.6, linestyle="--", zorder=2)
-        axes.text(size * (0.9 if side == "right" else 1.1), -0.65, name.upper(), color=colour, ha=side, fontsize=9)
-    axes.set_xscale("log")
-    axes.set_xlim(100.0, 30 * max(size for _, size, _ in shown))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _shown(value)))
-    changes = f"{up['changed_per_km']['first']:.0f} changes a km; lines: what a link carries up during the drive"
-    _titled(axes, f"Upload of one drive of {1e3 * found['km']:.0f} m", f"world seed {found['seed']}, {changes}")
-
-
-def _steady_bytes(found: Mapping[str, Any]) -> float:
-    return float(1e3 * found["upload"]["kB_per_km"]["steady"] * found["km"])
 
 
 def _fleet(axes: Axes, found: Mapping[str, Any]) -> None:

@@ -6,19 +6,24 @@ from typing import Final
 
 import numpy as np
 
+from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig, DriveSimulation
+from gnd.fleet_sim.sensors import MODELS
+from gnd.fleet_sim.traffic import Traffic
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.codec import CODECS, LATTICES, Codec, lattice_of, snap
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.schemas.drive import Scan
 from studies.codec_scenes import PosedScan, kl_median, plain_protobuf, pose_shift_cm
 from studies.frame.measure import core_s
 from studies.frame.scans import posed
-from studies.short_drives import MappedStreet
 
 TILE_VOXELS: Final = 2_500
 _SCANS: Final = 40
 _MARGIN_M: Final = 100.0
+_EDGE_S: Final = 0.2
 
 Tiles = Mapping[TileId, Gaussians]
 
@@ -51,14 +56,14 @@ def codec_measures(world: World, tiles: Tiles, sensor_model: str) -> dict[str, C
         tiles: its map.
         sensor_model: of the scans.
     """
-    street = MappedStreet(world, _MARGIN_M)
-    scans = _posed_scans(street, sensor_model)
+    circle = covering_circle(world.lat_rad, world.lon_rad, world.half_length_m + _MARGIN_M)
+    grid_frame, scans = GridFrame.around(world.frame, circle), _posed_scans(world, sensor_model)
     found = {}
     for name, lattice in LATTICES.items():
         snapped = {tile: snap(gaussians, lattice) for tile, gaussians in tiles.items()}
         first, second = (codec for codec in CODECS.values() if lattice_of(codec.codec_id) is lattice)
         encode_ms, decode_ms = _times_ms(first, snapped)
-        shift = pose_shift_cm(street.grid_frame, tiles, snapped, scans)
+        shift = pose_shift_cm(grid_frame, tiles, snapped, scans)
         found[name] = CodecMeasures(
             bytes_per_voxel=_bytes_per_voxel(first, snapped),
             zstd_bytes_per_voxel=_bytes_per_voxel(second, snapped),
@@ -88,9 +93,15 @@ def _times_ms(codec: Codec, tiles: Tiles) -> tuple[float, float]:
     return encode_s * scale, decode_s * scale
 
 
-def _posed_scans(street: MappedStreet, sensor_model: str) -> list[PosedScan]:
+def _posed_scans(world: World, sensor_model: str) -> list[PosedScan]:
     """Scans evenly along a drive before the changes, sweep motion removed, with their true poses."""
-    drive = street.drive(sensor_model, "before", 1, street.world.seed)
+    traffic = Traffic.urban()
+    drive = DriveSimulation(
+        world, DriveConfig("car", sensor_model, "before", seed=world.seed, car_share=0.2, traffic=traffic)
+    )
+    t_s = np.arange(-_EDGE_S, drive.scans / MODELS[sensor_model].rate_hz + _EDGE_S, 0.01)
+    t_ns = EPOCH_NS + np.round(t_s * 1e9).astype(np.int64)
+    truth = Trajectory(t_ns, np.asarray(drive.motion.T_map_vehicle(t_s)))
     scans = [item for item in drive.items() if isinstance(item, Scan)]
     every = max(1, len(scans) // _SCANS)
-    return [posed(scan, drive.truth, drive.simulation.header().T_vehicle_lidar) for scan in scans[every::every]]
+    return [posed(scan, truth, drive.header().T_vehicle_lidar) for scan in scans[every::every]]

@@ -321,7 +321,6 @@ def _rounded(values: Mapping[str, float]) -> dict[str, float]:
 
 MAPS = (
     ("pcd", "PCD, 0.2 m"),
-    ("pcd_compressed", "PCD compressed"),
     ("laz", "LAZ, 1 cm"),
     ("draco", "Draco, 12 bits"),
     ("gnd_protobuf", "GND, protobuf of doubles"),

@@ -14,6 +14,7 @@ from gnd.cloud_merger.features import FeatureMergeParameters
 from gnd.cloud_merger.map_parameters import digest_of, text_of, with_text
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.deploy.map_cli import map_group
+from gnd.schemas.feature_layer import LayerParameters
 
 
 @pytest.fixture
@@ -164,6 +165,10 @@ def test_parameters_that_are_not_what_their_digest_says_are_told(cloud, how, say
 
 def test_parameters_come_back_from_their_text_and_say_when_they_cannot():
     assert with_text(ShardConfig(), text_of(OTHERWISE)) == OTHERWISE
+    hydrants = LayerParameters("hydrants", "camera", ("hydrant",), reach_m=4.0)
+    declared = replace(OTHERWISE, feature_layer=(hydrants,))
+    assert with_text(ShardConfig(), text_of(declared)).merge_of("hydrants").reach_m == 4.0
+    assert with_text(declared, text_of(OTHERWISE)) == OTHERWISE  # a map that was made without the declaration
     assert text_of(OTHERWISE) != text_of(ShardConfig()) == text_of(ShardConfig("another", poll_s=1.0))
     said = json.loads(text_of(OTHERWISE))
     for wrong in (said | {"format": 2}, said | {"merge": {"knob": 1}}, {"format": 1}, []):

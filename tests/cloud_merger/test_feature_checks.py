@@ -9,11 +9,12 @@ from feature_cloud import ABSENT, EAST, EXIST, TILE, change, feature, found, lin
 from merger_world import GROUND, POLE, change_of, gaussians_of, report_of
 from upload_desk import NOW, Desk
 
-from gnd.cloud_merger.errors import BadReport, MergerError
-from gnd.cloud_merger.features.check import FeatureLimits, check_feature_report
+from gnd.cloud_merger.errors import BadReport
+from gnd.cloud_merger.features.check import check_feature_report
 from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureReport
 from gnd.schemas.keys import change_key
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -27,14 +28,14 @@ def known(tile, sha):
     return {one.feature_id for one in MAP} if sha == FeatureTile.of(TILE, 1, MAP).sha and tile == TILE else None
 
 
-def refusal(*changes, limits=None):
+def refusal(*changes, layer=None):
     with pytest.raises(BadReport) as caught:
-        check_feature_report(report(1, *changes), limits or FeatureLimits(), known)
+        check_feature_report(report(1, *changes), known, layer)
     return str(caught.value)
 
 
 def check(*changes):
-    check_feature_report(report(1, *changes), FeatureLimits(), known)
+    check_feature_report(report(1, *changes), known)
 
 
 def with_cov(*cov):
@@ -49,7 +50,7 @@ def test_a_good_report_passes():
 
 def test_a_drive_that_finds_every_sign_gone_is_not_believed():
     every = [seen(one.feature_id, ABSENT) for one in MAP]
-    assert "9 of 9 judged features are said to be deleted, the limit is 0.5 of 5" in refusal(change(*every, base=MAP))
+    assert "9 of 9 judged features are called deleted, the limit is 0.5 of 5" in refusal(change(*every, base=MAP))
     some = [seen(n, ABSENT if n < 5 else EXIST) for n in range(1, 10)]
     check(change(*some, base=MAP))
     check(change(*every[:4], base=MAP))  # too few to tell; one vehicle changes nothing anyway
@@ -76,7 +77,7 @@ def test_a_covariance_that_is_none_never_comes_so_far():
 
 def test_unknown_heights_pass_as_they_travel():
     whole = report(1, change(found(0.0, 0.0, height_m2=1e4), found(3.0, 0.0, sigma_m=1e-3, height_m2=1e-6)))
-    check_feature_report(FeatureReport.decode(whole.encode()), FeatureLimits(), known)
+    check_feature_report(FeatureReport.decode(whole.encode()), known)
 
 
 def test_a_measurement_far_outside_the_tile_is_refused():
@@ -86,11 +87,22 @@ def test_a_measurement_far_outside_the_tile_is_refused():
 
 
 def test_too_many_features_are_refused():
-    many = [found(0.1 * n, 0.5 * n - 12) for n in range(50)]
-    limits = FeatureLimits(max_features_of_tile=49)
-    assert "50 features found, 0 judged, the limit is 49" in refusal(change(*many), limits=limits)
-    wide = line(*[(0.1 * n, 0.0) for n in range(60)])
-    assert "60 vertices, the limit is 59" in refusal(change(wide), limits=FeatureLimits(max_vertices=59))
+    many = [found(0.1 * n - 12.8, (n % 50) * 0.5 - 12) for n in range(257)]
+    check(change(*many[:256]))
+    assert "257 features found, 0 judged, the limit is 256" in refusal(change(*many))
+    assert "513 vertices, the limit is 512" in refusal(change(line(*[(0.02 * n, 0.0) for n in range(513)])))
+
+
+def test_a_declared_layer_takes_its_own_kinds_and_geometry_only():
+    hydrants = LayerParameters("signs", "camera", ("hydrant",))
+    check_feature_report(report(1, change(found(1.0, 1.0, kind="hydrant"))), known, hydrants)
+    said = refusal(change(found(1.0, 1.0, kind="pole")), layer=hydrants)
+    assert "found pole 0: layer signs is declared to hold hydrant" in said
+    lines = dataclasses.replace(hydrants, kinds=("lane_boundary",), geometry="line")
+    check_feature_report(report(1, change(line((0, 0), (5, 0)))), known, lines)
+    assert "2 vertices, layer signs holds points" in refusal(
+        change(line((0, 0), (5, 0))), layer=dataclasses.replace(lines, geometry="point")
+    )
 
 
 def test_the_same_thing_twice_in_a_report_is_refused():
@@ -112,18 +124,6 @@ def test_verdicts_on_what_the_version_has_not_are_refused():
         change(seen(99), base=MAP)
     )
     check(change(seen(1), base=MAP[:3]))  # a version that has gone: nobody knows what it had
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"max_features_of_tile": 0},
-        {"max_vertices": 0},
-    ],
-)
-def test_limits_without_meaning_are_refused(wrong):
-    with pytest.raises(MergerError, match=next(iter(wrong))):
-        FeatureLimits(**wrong)
 
 
 # Through ingest, on a store

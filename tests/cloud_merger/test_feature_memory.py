@@ -20,7 +20,6 @@ from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.expel import without_vehicle
 from gnd.cloud_merger.features import FeatureMergeParameters
 from gnd.cloud_merger.features import fold as folding
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.fold import MEASURERS_KEPT, NAMES_KEPT, VOTES_KEPT
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.features.memory import LayerMemory
@@ -48,7 +47,7 @@ class Cloud:
         self.now_ns, self.number, self.heard = START_NS, 0, []
         self.store = SqliteStore(path, StoreConfig(merge_delay_s=0.0, **store), now_ns=lambda: self.now_ns)
         self.store.put_tiles([FeatureTile.of(TILE, 1, epoch)], layer="signs")
-        self.inbox = FeatureInbox(self.store, FeatureLimits(), self.config.features.reach_m, reach_tiles=3)
+        self.inbox = FeatureInbox(self.store, self.config.features, (), reach_tiles=3)
         self.worker = Worker(self.store, self.config)
 
     def head(self):

@@ -207,11 +207,10 @@ def stretched(east_m, north_m):
 
 def test_candidates_that_turn_out_to_be_one_are_joined():
     """Two drives know the place so little that neither gate holds the other; a third, sure one, lies between."""
-    apart = [report(1, change(found(0.0, 0.0, sigma_m=0.5))), report(2, change(found(2.6, 0.0, sigma_m=0.5)))]
-    wide = FeatureMergeParameters(gate=0.99)
-    assert len(merge((), apart, wide).estimates) == 2
-    between = [report(n, change(found(1.3, 0.0, sigma_m=0.5))) for n in (3, 4, 5, 6)]
-    merged = merge((), [*apart, *between], wide)
+    apart = [report(1, change(found(0.0, 0.0, sigma_m=0.5))), report(2, change(found(2.7, 0.0, sigma_m=0.5)))]
+    assert len(merge((), apart).estimates) == 2
+    between = [report(n, change(found(1.35, 0.0, sigma_m=0.5))) for n in (3, 4, 5, 6)]
+    merged = merge((), [*apart, *between])
     (new,), (now,) = merged.features, merged.estimates
     assert now.vehicles == 6
     assert len(merged.provenance[new.feature_id]) == 6
@@ -350,7 +349,6 @@ def test_masses_never_become_so_sure_that_nothing_could_change_them():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"gate": 1.0},
         {"reach_m": 0.0},
         {"min_vehicles": 1},
         {"min_vehicles": 7},

@@ -13,7 +13,6 @@ from feature_cloud import EXIST, TILE, change, feature, found, published, report
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.features import FeatureMergeParameters
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.features.memory import LayerMemory
 from gnd.cloud_merger.verify import Verifier
@@ -47,7 +46,7 @@ def merges(store):
 
 
 def hears(store, number, *said, vehicle, later_s=0):
-    inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
+    inbox = FeatureInbox(store, FeatureMergeParameters(), (), reach_tiles=3)
     store.put_reports(inbox.rows(report(number, change(*said, base=MAP), vehicle=vehicle), START_NS + later_s * 10**9))
     merges(store)
 

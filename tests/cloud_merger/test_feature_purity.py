@@ -24,7 +24,6 @@ from hypothesis import strategies as st
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.features import FeatureMergeParameters
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.existence import pooled
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.work import Worker
@@ -132,7 +131,7 @@ def through_store(path, batches):
     with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([FeatureTile.of(TILE, 1, MAP)], layer="signs")
         worker = Worker(store, ShardConfig(store_path=path))
-        inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
+        inbox = FeatureInbox(store, FeatureMergeParameters(), (), reach_tiles=3)
         for batch in batches:
             store.put_reports([row for one in batch for row in inbox.rows(one, 0)])
             while claims := store.claim("one", 16, 30.0):

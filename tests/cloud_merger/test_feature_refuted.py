@@ -9,7 +9,6 @@ from feature_cloud import ABSENT, TILE, change, feature, found, report, seen
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.features import FeatureMergeParameters, merge_layer
 from gnd.cloud_merger.features import merge as merging
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.verify import Verifier
 from gnd.cloud_merger.work import Worker
@@ -117,7 +116,7 @@ def filled(path, cars: dict[int, range | None]) -> tuple[dict, list[dict]]:
     """The layer and the named vehicles of a store whose shard has merged what the cars said, one after the other."""
     with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([FeatureTile.of(tile, 1, mapped(n)) for n, tile in enumerate(ROAD)], layer="signs")
-        inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
+        inbox = FeatureInbox(store, FeatureMergeParameters(), (), reach_tiles=3)
         worker = Worker(store, ShardConfig(store_path=path))
         for car, lost in cars.items():
             store.put_reports([row for one in drive(car, lost) for row in inbox.rows(one, 0)])
@@ -140,7 +139,7 @@ def test_who_was_refuted_goes_into_the_journal_so_the_layer_can_be_computed_anew
     """The drives an hour apart, so that each is folded before the next; then every version is verified."""
     with SqliteStore(tmp_path / "map.sqlite", StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([FeatureTile.of(tile, 1, mapped(n)) for n, tile in enumerate(ROAD)], layer="signs")
-        inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
+        inbox = FeatureInbox(store, FeatureMergeParameters(), (), reach_tiles=3)
         config = ShardConfig(store_path=store.path)
         worker = Worker(store, config)
         for hour, (car, lost) in enumerate([(1, None), (2, None), (3, LOST), (4, None), (5, None), (6, None)]):

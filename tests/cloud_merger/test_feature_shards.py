@@ -9,7 +9,6 @@ from merger_processes import DEADLINE_S, Cloud, in_threads, wait_for
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.features import FeatureMergeParameters
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.ownership import owner_of
 from gnd.cloud_merger.verify import Verifier
@@ -78,7 +77,7 @@ def fault_free(path, reports, received_ns):
     """Head hashes when one worker merges the reports one by one, in order of receipt."""
     with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([FeatureTile.of(tile, 1, MAP) for tile in TILES], layer=LAYER)
-        inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
+        inbox = FeatureInbox(store, FeatureMergeParameters(), (), reach_tiles=3)
         worker = Worker(store, ShardConfig(store_path=path))
         for one in sorted(reports, key=lambda one: received_ns[one.report_id]):
             store.put_reports(inbox.rows(one, received_ns[one.report_id]))

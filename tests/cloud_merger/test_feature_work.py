@@ -6,7 +6,6 @@ from merger_world import GROUND, WALL, change_of, gaussians_of, report_of, tile_
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.features import FeatureMergeParameters
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.work import Worker
 from gnd.gnd_map.features import FeatureTile
@@ -31,7 +30,7 @@ def worker(store, tmp_path):
 
 @pytest.fixture
 def keep(store):
-    inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
+    inbox = FeatureInbox(store, FeatureMergeParameters(), (), reach_tiles=3)
     return lambda *reports: store.put_reports([row for one in reports for row in inbox.rows(one, 0)])
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from merger_world import NEIGHBOUR, TILE
 
-from gnd.cloud_merger.errors import MergerError
-from gnd.cloud_merger.waiting import Promises, WaitingLimits
+from gnd.cloud_merger import waiting
+from gnd.cloud_merger.waiting import Promises
 
 SECOND = 1_000_000_000
 
@@ -28,7 +28,7 @@ def asked(*voxels, tile=TILE):
 
 
 def test_what_was_asked_of_others_is_promised_and_own_is_not(clock):
-    promises = Promises(WaitingLimits(), clock)
+    promises = Promises(clock)
     promises.note("a", "ndt", asked(3, 4))
     promises.note("b", "ndt", asked(4))
     promises.note("c", "ndt_other", asked(4))
@@ -37,31 +37,26 @@ def test_what_was_asked_of_others_is_promised_and_own_is_not(clock):
     assert promises.of(NEIGHBOUR, "ndt", but="c").tolist() == []
 
 
-def test_the_oldest_make_room(clock):
-    promises = Promises(WaitingLimits(reports=2), clock)
+def test_the_oldest_make_room(clock, monkeypatch):
+    monkeypatch.setattr(waiting, "MOST_REPORTS", 2)
+    promises = Promises(clock)
     for number, name in enumerate("abc"):
         promises.note(name, "ndt", asked(number))
     assert promises.of(TILE, "ndt", but="").tolist() == [1, 2]
 
 
 def test_a_promise_that_is_not_kept_in_time_counts_no_more(clock):
-    promises = Promises(WaitingLimits(keep_s=10), clock)
+    promises = Promises(clock)
     promises.note("a", "ndt", asked(1))
-    clock.now = 10 * SECOND
+    clock.now = int(waiting.KEEP_S) * SECOND
     assert promises.of(TILE, "ndt", but="").tolist() == [1]
     clock.now += 1
     assert promises.of(TILE, "ndt", but="").tolist() == []
 
 
 def test_a_promise_that_was_kept_is_forgotten(clock):
-    promises = Promises(WaitingLimits(), clock)
+    promises = Promises(clock)
     promises.note("a", "ndt", asked(1))
     promises.forget("a")
     promises.forget("never there")
     assert len(promises) == 0
-
-
-@pytest.mark.parametrize("bad", [{"reports": 0}, {"keep_s": 0.0}])
-def test_limits_that_cannot_work_are_refused(bad):
-    with pytest.raises(MergerError, match="lies outside"):
-        WaitingLimits(**bad)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-PRODUCT = ("cloud_merger", "deploy", "fleet_bus", "gnd_map", "schemas", "tile_store", "vehicle_agent")
+PRODUCT = ("cloud_merger", "deploy", "fleet_bus", "gnd_map", "schemas", "tile_client", "tile_store", "vehicle_agent")
 NAMES = re.compile(r"(Parameters|Limits|Config|Noise)$")
 
 

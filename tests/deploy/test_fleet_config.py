@@ -3,6 +3,8 @@ from pathlib import Path
 import pytest
 
 from gnd.deploy.errors import DeployError
+from gnd.deploy.fleet import shard_config
+from gnd.deploy.fleet_cli import by_part
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
 from gnd.gnd_map.errors import ConfigError, GndError
 
@@ -32,7 +34,7 @@ def test_an_unknown_key_is_named(tmp_path: Path) -> None:
         {"agents": 100_000},
         {"shards": 0},
         {"port": 70_000},
-        {"merge_mode": "magic"},
+        {"layers": ["ndt", "ndt"]},
         {"deadline_s": 0.0},
         {"headway_s": -1.0},
         {"headway_s": float("nan")},
@@ -60,3 +62,13 @@ def test_layers_are_those_that_vehicles_detect_with_ndt_among_them() -> None:
     for layers, message in ((["signs"], "must hold 'ndt'"), (["ndt", "trees"], "trees"), (["ndt", "ndt"], "twice")):
         with pytest.raises(DeployError, match=message):
             load_fleet_config(None, {"layers": layers})
+
+
+def test_the_modes_are_settings_of_agents_and_shards() -> None:
+    options = {"agents": 3, "detect_mode": "paper", "merge_mode": None}
+    config = load_fleet_config(None, by_part(options), ["merger.store.merge_delay_s=2.5"])
+    assert (config.agents, config.agent) == (3, {"detect": {"mode": "paper"}})
+    shard = shard_config(config, "shard-0", Path("map.sqlite"), "tcp/127.0.0.1:7447")
+    assert (shard.merge.mode, shard.store.merge_delay_s, shard.store.merge_after_reports) == ("default", 2.5, 16)
+    with pytest.raises(GndError, match="magic"):
+        load_fleet_config(None, {"merger": {"merge": {"mode": "magic"}}})

@@ -3,8 +3,8 @@ from click.testing import CliRunner
 from load_testing import make_run
 
 from gnd.deploy.cli import gnd
+from gnd.deploy.errors import LoadError
 from gnd.deploy.load.command import table_of
-from gnd.deploy.load.errors import LoadError
 
 
 def said(*arguments):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from load_testing import LENGTH_M, against, make_run, put_vehicle, street_tiles, whole_report
 
+from gnd.deploy.errors import LoadError
 from gnd.deploy.load.drives import KeptRuns, read_street
-from gnd.deploy.load.errors import LoadError
 from gnd.deploy.load.plan import LoadOptions, Timetable, shared_out
 from gnd.deploy.load.streets import Streets
 from gnd.deploy.run_folder import RunFolder

@@ -4,7 +4,7 @@ from load_testing import FIRST, street_tiles, track_along, whole_report
 
 from gnd.cloud_merger.errors import MissingBase
 from gnd.cloud_merger.expanding import expand, with_measured
-from gnd.deploy.load.errors import LoadError
+from gnd.deploy.errors import LoadError
 from gnd.deploy.load.shift import (
     DISTRICT_TILES,
     DISTRICTS_ROUND,

@@ -14,6 +14,7 @@ OURS = (
     "schemas",
     "fleet_bus",
     "tile_store",
+    "tile_client",
     "vehicle_agent",
     "cloud_merger",
     "fleet_sim",

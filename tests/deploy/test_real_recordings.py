@@ -21,6 +21,8 @@ from gnd.schemas.drive_mcap import load_track, read_header
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.importer import import_recording
+from gnd.vehicle_agent.importers.choices import Choices
+from gnd.vehicle_agent.importers.recording import NOMINAL as ANCHOR
 
 pytestmark = pytest.mark.slow
 
@@ -70,7 +72,9 @@ def shares(
 @pytest.mark.parametrize("recording", [KITTI, RADIATE], ids=lambda recording: recording.kind)
 def test_inserted_objects_come_back_as_new_and_deleted(recording: Recording, shared_data: Path, tmp_path: Path) -> None:
     whole = tmp_path / "whole.mcap"
-    import_recording(recording.kind, shared_data / recording.folder, whole)
+    folder, choices = shared_data / recording.folder, Choices(stand_ins=True)
+    anchor = ANCHOR if recording.kind == "kitti" else None  # RADIATE has its own place
+    import_recording(recording.kind, folder, whole, anchor=anchor, choices=choices)
     new = box_at(whole, recording.new_at_m, recording.half_m)
     gone = box_at(whole, recording.gone_at_m, recording.half_m)
     mapped = rewrite_drive(whole, tmp_path / "mapped.mcap", [gone], slice(0, None, 2))

@@ -11,14 +11,14 @@ from click.testing import CliRunner
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.deploy.cli import gnd
-from gnd.deploy.configuration_page import page, programs
+from gnd.deploy.configuration_page import page, settings_class
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
 from gnd.fleet_bus.settings_file import layers_of, load_settings, read_toml, write_settings
 from gnd.gnd_map.errors import ConfigError, GndError
 from gnd.gnd_map.settings import described, from_settings, settings_sha256, settings_text
+from gnd.schemas.feature_layer import LAYERS
 from gnd.tile_store.cli import TileServerConfig
 from gnd.vehicle_agent.config import AgentConfig
-from gnd.vehicle_agent.features.layer_parameters import LAYERS
 from gnd.vehicle_agent.settings import agent_of, load_agent
 
 BARE: dict[str, Any] = {
@@ -29,7 +29,7 @@ BARE: dict[str, Any] = {
 }
 WORDS = {
     "shard_id": "merger-7", "codec": "float", "link": "3g", "layer": "ndt2", "vehicle": "w", "localise_by": "lidar",
-    "wrong_mounts": ("3:0.5",), "detect_mode": "paper", "merge_mode": "paper", "connect": ("tcp/10.0.0.1:7448",),
+    "wrong_mounts": ("3:0.5",), "connect": ("tcp/10.0.0.1:7448",),
     "layers": ("ndt", "signs"), "passing_rule": "ahead", "protocol": "full", "mode": "paper",
 }  # fmt: skip
 
@@ -66,7 +66,7 @@ def candidates(name: str, value: Any, told: Any) -> list[Any]:
         return [{"Ouster": 0.75} if name == "sensor_weights" else {"poll_s" if name == "merger" else "pace": 0.75}]
     if isinstance(value, tuple) and value and isinstance(value[0], float):
         return [tuple(1.5 * item for item in value)]
-    if name == "layers" and not value:
+    if name in ("layers", "feature_layer") and not value:
         return [(LAYERS["signs"], replace(LAYERS["poles"], range_m=12.0))]
     return [WORDS[name]]
 
@@ -97,7 +97,7 @@ def test_every_value_changed_means_every_value(program: str) -> None:
 
 @pytest.mark.parametrize("program", list(BARE))
 def test_every_setting_is_explained(program: str) -> None:
-    for row in described(programs()[program][0]):
+    for row in described(settings_class(program)):
         assert row.setting.effect[:1].isupper() or row.setting.effect.startswith(("...", "…", "`", '"', "λ", "η")), row
         assert row.setting.effect.rstrip().endswith((".", "...", "…")), row
         lengths = {"_m": "m", "_s": "s", "_rad": "rad", "_deg": "deg", "_ms": "ms"}
@@ -131,6 +131,49 @@ def test_layers_are_named_or_described() -> None:
     own = {"name": "hydrants", "sensor": "camera", "kinds": ["hydrant"]}
     layers = agent_of({"drive": "d", "features": {"layers": ["signs", own]}}).features.layers
     assert (layers[0], layers[1].name, layers[1].kinds) == (LAYERS["signs"], "hydrants", ("hydrant",))
+
+
+HYDRANTS = """
+[[feature_layer]]
+name = "hydrants"
+kinds = ["hydrant"]
+sensor = "camera"
+reach_m = 4.0
+"""
+
+
+def test_one_table_declares_a_layer_to_every_program(tmp_path: Path) -> None:
+    file = tmp_path / "hydrants.toml"
+    file.write_text(HYDRANTS)
+    agent = load_agent(file, (), {"drive": "d", "features": {"layers": ["hydrants", "signs"]}}, {})
+    assert [layer.name for layer in agent.features.layers] == ["hydrants", "signs"]
+    shard = load_settings(ShardConfig, "merger", file, (), {}, {})
+    assert shard.feature_layer == agent.feature_layer == agent.features.layers[:1]
+    assert (shard.merge_of("hydrants").reach_m, shard.merge_of("signs").reach_m) == (4.0, shard.features.reach_m)
+    assert load_settings(TileServerConfig, "store", file, (), {"path": "m"}, {}).feature_layer == shard.feature_layer
+    fleet = load_fleet_config(file, {"layers": ["ndt", "hydrants"]}, (), {})
+    assert fleet.feature_layer == shard.feature_layer
+
+
+def test_a_layer_that_nobody_declared_is_an_error_that_says_what_to_write(tmp_path: Path) -> None:
+    file = tmp_path / "hydrants.toml"
+    file.write_text(HYDRANTS)
+    with pytest.raises(
+        GndError, match=r"no layer 'hydrant'; known are .*hydrants.*\[\[feature_layer\]\] name = \"hydrant\""
+    ):
+        load_agent(file, (), {"drive": "d", "features": {"layers": ["hydrant"]}}, {})
+    for wrong, message in (
+        ('geometry = "line"', "holds lines"),
+        ('geometry = "area"', "'point', 'line'"),
+        ("reach_m = 200", "reach_m = 200.0 lies outside"),
+        ("reech_m = 2", "unknown key reech_m"),
+    ):
+        file.write_text(HYDRANTS.replace("reach_m = 4.0", wrong))
+        with pytest.raises(GndError, match=message):
+            load_agent(file, (), {"drive": "d", "features": {"layers": ["hydrants"]}}, {})
+    file.write_text(HYDRANTS.replace("camera", "lidar"))
+    with pytest.raises(GndError, match="finds pole, trunk, traffic_sign, streetlight, no hydrant"):
+        load_agent(file, (), {"drive": "d", "features": {"layers": ["hydrants"]}}, {})
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_city_coordinates_are_utm_less_the_origin(name: str) -> None:
 
 def test_a_map_gives_borders_crosswalks_and_areas() -> None:
     found = read(MAP)
-    assert found.layers == {"crosswalks": 1, "drivable_areas": 1, "lanes": 5}
+    assert found.layers == {"crosswalks": 1, "drivable_areas": 1, "lanes": 4}
     shared = found.features[0]  # lanes 1 and 2 name the same border, in opposite directions
     assert dict(shared.attributes)["lanes"] == "1:left 2:left"
     assert dict(shared.attributes) == {"lane_type": "VEHICLE", "lanes": "1:left 2:left", "mark": "SOLID_WHITE"}
@@ -76,7 +76,7 @@ def test_a_height_offset_makes_heights_known() -> None:
 
 def test_kinds_go_where_they_are_told_to() -> None:
     found = read(MAP, layers={"crosswalk": "zebras", "drivable_area": "-"})
-    assert found.layers == {"lanes": 5, "zebras": 1}
+    assert found.layers == {"lanes": 4, "zebras": 1}
     assert found.left_out == {"drivable_area": 1}
 
 
@@ -97,16 +97,7 @@ BAD = [
     (changed([*LANE, "left_lane_boundary", 0, "x"], "5"), errors.BadElement, "'5' is no number"),
     (changed([*LANE, "left_lane_boundary", 0], {"x": 1}), errors.BadElement, "has no y"),
     (changed([*LANE, "left_lane_boundary", 0, "x"], 2e5), errors.BadGeometry, "200000 m from the city's origin"),
-    (
-        changed([*LANE, "right_lane_boundary"], at((5000, 2396), (5050, 2404))),
-        errors.BadGeometry,
-        "lane segment 1: its borders cross each other, segment 1 of 1",
-    ),
-    (
-        changed(["drivable_areas", "9", "area_boundary"], at((0, 0), (9, 9), (9, 0), (0, 9))),
-        errors.BadGeometry,
-        "crosses itself",
-    ),
+    (changed([*LANE, "successors"], None), errors.BadElement, "lane segment 1: successors is NoneType"),
 ]
 
 
@@ -115,6 +106,24 @@ def test_a_map_with_a_fault_is_refused(told: Any, kind: type[Exception], said: s
     with pytest.raises(kind) as caught:
         read(told)
     assert said in str(caught.value)
+
+
+CROSSED = [
+    (
+        changed([*LANE, "right_lane_boundary"], at((5000, 2396), (5050, 2404))),
+        "lane segment 1: its borders cross each other, segment 1 of 1",
+    ),
+    (changed(["drivable_areas", "9", "area_boundary"], at((0, 0), (9, 9), (9, 0), (0, 9))), "crosses itself"),
+]
+
+
+@pytest.mark.parametrize(("told", "said"), CROSSED, ids=[said for _, said in CROSSED])
+def test_what_crosses_is_reported_and_strictly_refused(told: Any, said: str) -> None:
+    found = read(told)
+    assert len(found.features) == len(read(MAP).features)
+    assert said in found.notes[0]
+    with pytest.raises(errors.BadGeometry, match=said.split(",")[0]):
+        read(told, strict=True)
 
 
 def test_a_city_that_nobody_names_is_asked_for() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_maps import STREET, put, write
+from small_maps import STREET, exported, put, write
 
 from gnd.gnd_map.errors import GndError
 from gnd.tile_store.feature_io import errors
@@ -54,7 +54,6 @@ OSM = [
     ('<?xml version="1.0" encoding="ISO-8859-1"?>' + osm(NODES), errors.UnknownFormat, "encoding 'ISO-8859-1'"),
     ("<gpx/>", errors.UnknownFormat, "root element <gpx>"),
     (osm(NODES, 'version="0.5"'), errors.UnknownFormat, "OSM version '0.5', known is 0.6"),
-    (osm('<MetaInfo format_version="2"/>'), errors.UnknownFormat, "map format '2'"),
     (osm('<node id="1" lat="49"/>'), errors.BadElement, "node 1 has no lon, so no position"),
     (osm('<node lat="49" lon="8"/>'), errors.BadElement, "<node> without id"),
     (osm('<node id="x" lat="49" lon="8"/>'), errors.BadElement, "id='x' of <node> is no whole number"),
@@ -87,14 +86,6 @@ OSM = [
         errors.MissingReference,
         "the right border of lanelet 9: none is given",
     ),
-    (osm(NODES + line(5, 1)), errors.BadGeometry, "way 5 (lane_boundary) has 1 node; a line needs 2"),
-    (osm(NODES + line(5)), errors.BadGeometry, "way 5 (lane_boundary) has no nodes, so no position"),
-    (osm(CROSSED + line(5, 1, 2, 3, 4)), errors.BadGeometry, "way 5 crosses itself: segments 0 and 2 of 3"),
-    (
-        osm(CROSSED + line(5, 1, 2) + line(6, 3, 4) + lanelet(5, 6)),
-        errors.BadGeometry,
-        "the borders of lanelet 9 cross each other",
-    ),
     (
         osm('<node id="1" lat="0" lon="0"><tag k="local_x" v="5"/><tag k="local_y" v="6"/></node>'),
         errors.NeedsGeoreference,
@@ -115,6 +106,38 @@ def test_a_lanelet2_file_with_a_fault_is_refused_whole(
     assert "\n" not in str(caught.value)
     assert "bad.osm" in str(caught.value)
     assert store.layers() == []
+
+
+CROSSINGS = [
+    (osm(NODES + line(6, 1, 2) + line(5, 1)), "way 5 (lane_boundary) has 1 nodes; a line needs 2"),
+    (osm(NODES + line(6, 1, 2) + line(5)), "way 5 (lane_boundary) has 0 nodes; a line needs 2"),
+    (osm(CROSSED + line(5, 1, 2, 3, 4)), "way 5 crosses itself: segments 0 and 2 of 3"),
+    (
+        osm(CROSSED + line(5, 1, 2) + line(6, 3, 4) + lanelet(5, 6)),
+        "the borders of lanelet 9 cross each other (segment 1 of 1 on the left, 1 of 1 on the right)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("body", "told"), CROSSINGS, ids=["one node", "no node", "a line", "borders"])
+def test_odd_lines_are_reported_and_kept_and_strictly_refused(
+    body: str, told: str, store: SqliteStore, tmp_path: Path
+) -> None:
+    file = write(tmp_path, "odd.osm", body)
+    with pytest.raises(errors.BadGeometry, match=r"cross|needs 2"):
+        put(store, file, ImportOptions(strict=True))
+    assert store.layers() == []
+    result = put(store, file)
+    assert told in result.notes[0]
+    assert exported(store, tmp_path / "back.osm") == body.encode()
+
+
+def test_of_many_findings_the_first_are_written_out(store: SqliteStore, tmp_path: Path) -> None:
+    notes = put(
+        store, write(tmp_path, "odd.osm", osm(CROSSED + "".join(line(n, 1, 2, 3, 4) for n in range(5, 35))))
+    ).notes
+    assert len(notes) == 21
+    assert notes[-1] == "and 10 more findings (--strict refuses the file)"
 
 
 def test_too_many_nodes_are_counted() -> None:
@@ -193,14 +216,6 @@ GEOJSON = [
         errors.BadGeometry,
         "geometry 'GeometryCollection'",
     ),
-    (
-        geojson(
-            {"type": "Feature", "geometry": {"type": "LineString", "coordinates": ZIGZAG},
-             "properties": {"kind": "lane_boundary"}}
-        ),
-        errors.BadGeometry,
-        "crosses itself",
-    ),
     (geojson(*[point([8, 49], kind="pole") | {"id": "a"}] * 2), errors.DuplicateId, "same id"),
     (geojson(point([8, 49], kind="pole"), **GND), errors.BadElement, "lacks the properties absent, conflict"),
     (geojson(point([8, 49], **OURS | {"feature_id": "x"})), errors.BadElement, "invalid literal for int()"),
@@ -209,6 +224,16 @@ GEOJSON = [
     (geojson(point([8, 49], **OURS | {"exist": 0.3}) | {"id": "5"}, **GND), errors.BadElement, "sum to"),
     (geojson(point([8, 49], **OURS | {"cov_m2": [1]}) | {"id": "5"}, **GND), errors.BadGeometry, "covariance of"),
 ]  # fmt: skip
+
+
+def test_a_geojson_line_that_crosses_itself_is_reported(store: SqliteStore, tmp_path: Path) -> None:
+    line = {"type": "LineString", "coordinates": ZIGZAG}
+    file = write(
+        tmp_path, "odd.geojson", geojson({"type": "Feature", "geometry": line, "properties": {"kind": "stop_line"}})
+    )
+    assert "crosses itself" in put(store, file).notes[0]
+    with pytest.raises(errors.BadGeometry, match="crosses itself"):
+        put(store, file, ImportOptions(strict=True))
 
 
 @pytest.mark.parametrize(("body", "kind", "told"), GEOJSON, ids=[told for _, _, told in GEOJSON])

@@ -150,8 +150,8 @@ def test_two_maps_of_the_same_place_coincide(pittsburgh: Path) -> None:
         off_m = np.array(list(offsets_m(a, b, frame)))
         pairs[kind], same[kind] = len(off_m), int((off_m < 2e-3).sum())
         assert off_m.max() < 0.15
-    assert pairs == {"lane_boundary": 137, "crosswalk": 5, "drivable_area": 5}
-    assert same == {"lane_boundary": 129, "crosswalk": 5, "drivable_area": 5}
+    assert pairs == {"lane_boundary": 127, "crosswalk": 5, "drivable_area": 5}
+    assert same == {"lane_boundary": 121, "crosswalk": 5, "drivable_area": 5}
 
 
 def offsets_m(a: list[MapFeature], b: list[MapFeature], frame: LocalFrame) -> Iterator[float]:

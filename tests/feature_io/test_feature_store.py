@@ -25,7 +25,7 @@ def test_an_import_says_what_it_did(store: SqliteStore, tmp_path: Path) -> None:
     file = write(tmp_path, "street.osm", STREET)
     first = put(store, file)
     assert (first.source, first.format, dict(first.features)) == ("street.osm", "lanelet2", STREET_IDS)
-    assert (first.removed, first.unchanged, dict(first.left_out)) == (0, 0, {})
+    assert (first.removed, first.unchanged, dict(first.left_out)) == (0, 0, {"untyped_way": 1})
     again = put(store, file)
     assert (again.tiles, again.unchanged) == (0, first.tiles)
     assert [line.kind for line in store.history("poles", store.heads("poles")[0].tile)] == ["base"]
@@ -111,11 +111,11 @@ def test_features_are_found_by_layer_and_region(store: SqliteStore, tmp_path: Pa
     put(store, tmp_path / "street.osm", source="a")
     with pytest.raises(FeatureFileError, match=r"features come from a, street\.osm; say which"):
         export_features(store, tmp_path / "x.osm")
-    with pytest.raises(FeatureFileError, match=r"no Lanelet2 file 'c'; it has a, street\.osm"):
+    with pytest.raises(FeatureFileError, match=r"no lanelet2 file 'c'; it has a, street\.osm"):
         export_features(store, tmp_path / "x.osm", source="c")
     with pytest.raises(FeatureFileError, match="all layers and regions are written"):
         export_features(store, tmp_path / "x.osm", ["lanes"], source="a")
-    with pytest.raises(FeatureFileError, match="opendrive is read only"):
+    with pytest.raises(FeatureFileError, match="OpenDRIVE is written into the file"):
         export_features(store, tmp_path / "x.xodr")
     with pytest.raises(FeatureFileError, match=r"cannot write: No such file"):
         export_features(store, tmp_path / "none" / "x.geojson")

@@ -5,7 +5,7 @@ import pytest
 from sklearn.metrics import confusion_matrix, f1_score, precision_score, recall_score
 
 from gnd.fleet_sim.errors import EvaluationError
-from gnd.fleet_sim.evaluate import CLASSES, classes_of_maps, evaluate, evaluate_changes, evaluate_maps
+from gnd.fleet_sim.evaluate import CLASSES, classes_of_maps, evaluate, evaluate_maps
 from gnd.fleet_sim.truth import LEVELS, Truth
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.gaussian import Gaussians, concat
@@ -83,26 +83,6 @@ def test_classes_of_two_maps_follow_from_what_each_holds(edited: Truth) -> None:
     assert at(predicted, changed) == {ChangeClass.MODIFIED}
     assert at(predicted, rest) == {ChangeClass.NORMAL}
     assert at(back, gone) == {ChangeClass.NEW}
-
-
-def test_changes_that_say_what_the_perfect_map_does_score_the_same(edited: Truth) -> None:
-    final = perfect_map(edited)
-    predicted = classes_of_maps(edited, edited.before, final)
-    changes = {}
-    for tile in final:
-        rows = (edited.morton == tile.morton) & (predicted != ChangeClass.NORMAL) & (predicted != ChangeClass.EMPTY)
-        changes[tile] = edited.voxel_id[rows], predicted[rows]
-    assert evaluate_changes(edited, edited.before, changes).f1("all") == pytest.approx(100.0)
-
-
-def test_unmeasured_voxels_and_voxels_without_truth_change_nothing(edited: Truth) -> None:
-    tile = next(iter(edited.before))
-    ids = edited.before[tile].voxel_id[:4]
-    said = {tile: (ids, np.full(4, int(ChangeClass.UNMEASURED), np.uint8))}
-    stale = evaluate_maps(edited, edited.before, edited.before)
-    np.testing.assert_array_equal(evaluate_changes(edited, edited.before, said).predicted, stale.predicted)
-    far = {tile: (np.array([2_000_000_000], np.int32), np.array([ChangeClass.NEW], np.uint8))}
-    np.testing.assert_array_equal(evaluate_changes(edited, edited.before, far).predicted, stale.predicted)
 
 
 def test_a_prediction_of_the_wrong_size_or_with_a_sixth_class_is_refused(edited: Truth) -> None:

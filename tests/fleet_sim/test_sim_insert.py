@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from sim_worlds import small_world
 
-from gnd.fleet_sim.dense_scan import world_grid
 from gnd.fleet_sim.errors import SimError
-from gnd.fleet_sim.insert import Inserter, surface_points, surface_voxels
+from gnd.fleet_sim.insert import Inserter
 from gnd.fleet_sim.lidar import Lidar
 from gnd.fleet_sim.raycast import Scene
 from gnd.fleet_sim.sensors import VLP16
@@ -89,35 +87,3 @@ def test_a_sensor_far_away_sees_nothing_and_odd_arrays_are_refused() -> None:
     assert len(Inserter(OBJECTS).insert(np.empty((0, 3), np.float32), T).hit) == 0
     with pytest.raises(SimError, match="poses"):
         Inserter(OBJECTS).insert(np.zeros((5, 3), np.float32), np.zeros((4, 4, 4)))
-
-
-def test_surface_points_lie_on_the_surface() -> None:
-    block = Block(3.0, -2.0, 1.5, 0.5, 0.2, 1.4, 0.7, rise_x=0.1)
-    p = surface_points(block, 0.05)
-    c, s = np.cos(0.7), np.sin(0.7)
-    u, v = c * (p[:, 0] - 3) + s * (p[:, 1] + 2), -s * (p[:, 0] - 3) + c * (p[:, 1] + 2)
-    top = 1.4 + 0.1 * u
-    on_side = (np.abs(np.abs(u) - 1.5) < 1e-9) | (np.abs(np.abs(v) - 0.5) < 1e-9)
-    on_top = np.abs(p[:, 2] - top) < 1e-9
-    assert np.all(on_side | on_top)
-    assert np.all((np.abs(u) <= 1.5 + 1e-9) & (np.abs(v) <= 0.5 + 1e-9) & (p[:, 2] >= 0.2 - 1e-9))
-    q = surface_points(Post(0.0, 0.0, 0.4, 0.0, 2.0), 0.05)
-    r = np.hypot(q[:, 0], q[:, 1])
-    assert np.all((np.abs(r - 0.4) < 1e-9) | (np.abs(q[:, 2] - 2.0) < 1e-9))
-
-
-def test_surface_voxels_are_those_that_the_box_touches() -> None:
-    world = small_world()
-    grid = world_grid(world)
-    box = Block(10.0, 5.0, 1.1, 0.6, 0.1, 2.2, 0.4)
-    found = {
-        (tile.morton, int(voxel))
-        for tile, g in surface_voxels(grid, [box], n_min_cells=1).items()
-        for voxel in g.voxel_id
-    }
-    g = np.floor(grid.grid_of(surface_points(box, 0.013))).astype(np.int64)
-    morton, voxel_id = grid.tile_voxel_of(np.unique(g, axis=0))
-    expected = set(zip(morton.tolist(), voxel_id.tolist(), strict=True))
-    assert len(found ^ expected) <= 2, "only voxels touched by a corner may differ"
-    dense = surface_voxels(grid, [box])
-    assert 4 <= sum(len(g) for g in dense.values()) <= len(found)

@@ -39,7 +39,7 @@ def test_the_tiles_of_a_region_are_what_the_store_holds(cloud: Cloud) -> None:
 def test_a_large_district_comes_in_several_answers(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
     tiles = list(HERE.district.tiles())[:40]
     cloud.store.put_tiles([gaussian_tile(tile, 1, 2, 3) for tile in tiles], layer="ndt_many")
-    monkeypatch.setattr("gnd.fetching.BATCH_BYTES", 100)
+    monkeypatch.setattr("gnd.tile_client.fetching.BATCH_BYTES", 100)
     with gnd.connect(cloud.endpoint) as client:
         assert [tile.tile_id for tile in client.tiles(layer="ndt_many")] == tiles
 

@@ -7,13 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from api_testing import SCANS, Cloud, Program
+from api_testing import EAST, HERE, SCANS, Cloud, Program, sign_tile
 
 import gnd
+from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory
+from gnd.live_vehicle import FeatureTilesOfMap, Fetch, TilesOfMap
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.keys import batch_key
 from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 
 Files = tuple[Path, Path]
 
@@ -136,6 +142,35 @@ def test_what_is_no_mount_is_refused(opened: gnd.Map) -> None:
         gnd.Vehicle(opened, np.zeros((4, 4)))
     with pytest.raises(gnd.GndError, match="no such store"):
         gnd.Vehicle("nothing.sqlite", np.eye(4))
+
+
+def test_the_tiles_of_a_district_are_one_question_and_features_come_too(
+    cloud: Cloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloud.store.put_tiles([sign_tile(EAST, 8)], layer="signs")
+    lat_rad, lon_rad = HERE.centre_rad
+    frame = gnd.LocalFrame.of_tile(HERE)
+    with gnd.connect(cloud.endpoint) as client:
+        asked, request = list[str](), client.bus.request
+
+        def counted(key: str, *args: Any, **how: Any) -> bytes:
+            asked.append(key)
+            return request(key, *args, **how)
+
+        monkeypatch.setattr(client.bus, "request", counted)
+        local_map = LocalMap(GridFrame.around(frame, [HERE]))
+        place = Place(frame, GnssFix(0, lat_rad, lon_rad, 30.0, 1.0))
+        fetch: Fetch = lambda layer, tiles: client.fetch(tiles, layer=layer)  # noqa: E731
+        TilesAtHand(TilesOfMap(fetch, "ndt"), local_map, lambda _tile: False).follow(place)
+        held = {tile_id for tile_id in local_map.tiles if (tile := local_map.tile(tile_id)) and tile.version}
+        assert held == {HERE, EAST}
+        districts = {tile_id.district for tile_id in local_map.tiles}
+        assert sorted(asked) == sorted(batch_key("ndt", district) for district in districts)
+        asked.clear()
+        features = FeatureTilesOfMap(fetch, ["signs"])
+        assert [(layer, tile.tile_id) for layer, tile in features.follow(place)] == [("signs", HERE), ("signs", EAST)]
+        assert len(asked) == len(set(asked))
+        assert list(features.follow(place)) == [], "no way, no question"
 
 
 @pytest.mark.slow

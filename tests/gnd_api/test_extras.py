@@ -128,10 +128,34 @@ def test_a_command_without_its_extra_says_which_in_one_line(
     assert re.fullmatch(rf"gnd: {module} is not installed; it comes with: pip install 'gnd-fleet\[{extra}\]'", line)
 
 
-@pytest.mark.parametrize("command", ["--help", "map --help", "watch --help", "router --help"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "--help",
+        "map --help",
+        "watch --help",
+        "router --help",
+        "traffic --help",
+        "config show fleet",
+        "config show store",
+    ],
+)
 def test_commands_that_need_no_extra_work(bare: Callable[..., Program], command: str) -> None:
     program = bare("from gnd.deploy.cli import main; sys.argv[0] = 'gnd'; main()", *command.split())
     assert program.end() == 0, program.lines
+
+
+def test_a_fleet_without_all_extras_names_them_before_anything_is_written(
+    bare: Callable[..., Program], tmp_path: Path
+) -> None:
+    program = bare(
+        "from gnd.deploy.cli import main; sys.argv[0] = 'gnd'; main()", "fleet", "--out", str(tmp_path / "f")
+    )
+    assert program.end() == 2, program.lines
+    (line,) = program.lines
+    missing = ", ".join(sorted(extras.LEFT_OUT))
+    assert line == f"gnd: {missing}: not installed; this command needs: pip install 'gnd-fleet[all]'"
+    assert not (tmp_path / "f").exists()
 
 
 def test_localise_without_its_extra_says_which(bare: Callable[..., Program]) -> None:

@@ -16,10 +16,13 @@ from gnd.schemas.drive_mcap import drive_counts, load_track, read_drive, read_he
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import fit_heading_and_position, import_recording, open_recording
 from gnd.vehicle_agent.importer_cli import import_drives
+from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.recording import RecordingAnchor
 from gnd.vehicle_agent.importers.splits import chosen_scans
 
 ANCHOR = RecordingAnchor(37.56, 127.03, 30.0)
+STAND_INS = Choices(stand_ins=True)
+STRICT = Choices(strict=True)
 
 
 def scans_of(path: Path) -> list[Scan]:
@@ -37,7 +40,7 @@ def test_lidar_odometry_finds_how_the_vehicle_moved(kitti_folder, tmp_path):
 
 
 def test_what_a_drive_holds(kitti_folder, tmp_path):
-    import_recording("kitti", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR, vehicle="v1")
+    import_recording("kitti", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR, vehicle="v1", choices=STAND_INS)
     header, counts, track = (f(tmp_path / "a.mcap") for f in (read_header, drive_counts, load_track))
     assert (header.vehicle, header.sensor_model, header.drive_id) == ("v1", "HDL-64E", "sequence-all")
     assert np.degrees(header.anchor.lat_rad) == pytest.approx(37.56)
@@ -51,7 +54,7 @@ def test_what_a_drive_holds(kitti_folder, tmp_path):
 
 
 def test_points_come_through_bit_for_bit_in_file_order(kitti_folder, tmp_path):
-    import_recording("kitti", kitti_folder, tmp_path / "a.mcap")
+    import_recording("kitti", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR)
     for k, scan in enumerate(scans_of(tmp_path / "a.mcap")):
         np.testing.assert_array_equal(scan.points_m, scan_of(k).astype(np.float32))
         assert not scan.t_offset_ns.any()
@@ -59,7 +62,7 @@ def test_points_come_through_bit_for_bit_in_file_order(kitti_folder, tmp_path):
 
 def test_both_halves_lie_in_one_frame(kitti_folder, tmp_path):
     for half in ("even", "odd"):
-        import_recording("kitti", kitti_folder, tmp_path / f"{half}.mcap", scans=half)
+        import_recording("kitti", kitti_folder, tmp_path / f"{half}.mcap", scans=half, anchor=ANCHOR)
     even, odd = (load_track(tmp_path / f"{half}.mcap").reference for half in ("even", "odd"))
     common = np.intersect1d(even.t_ns, odd.t_ns)
     assert len(common) >= 6
@@ -69,7 +72,7 @@ def test_both_halves_lie_in_one_frame(kitti_folder, tmp_path):
 
 
 def test_items_come_in_time_order(kitti_folder, tmp_path):
-    import_recording("kitti", kitti_folder, tmp_path / "a.mcap")
+    import_recording("kitti", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR, choices=STAND_INS)
     times = [item.t_ns for item in read_drive(tmp_path / "a.mcap")]
     assert times == sorted(times)
 
@@ -80,8 +83,14 @@ def test_compressed_scans_without_times_poses_or_calibration(tmp_path):
     for k in range(3):
         points = np.column_stack([scan_of(k), np.ones(48_000)]).astype(np.float32)
         (folder / f"{k:03d}.bin.xz").write_bytes(lzma.compress(points.tobytes(), preset=0))
-    assert import_recording("kitti", folder, tmp_path / "a.mcap").scans == 3
-    assert drive_counts(tmp_path / "a.mcap").gnss == 3  # from the track
+    out = tmp_path / "a.mcap"
+    imported = import_recording("kitti", folder, out, anchor=ANCHOR)
+    assert imported.scans == 3
+    assert (drive_counts(out).gnss, drive_counts(out).motion, read_header(out).stand_ins) == (0, 0, ())
+    assert any("no GNSS and no speed and yaw rate measured: the drive has none" in note for note in imported.notes)
+    marked = import_recording("kitti", folder, out, anchor=ANCHOR, choices=STAND_INS)
+    assert (drive_counts(out).gnss, read_header(out).stand_ins) == (3, ("gnss", "motion"))
+    assert any("computed from the poses" in note for note in marked.notes)
 
 
 def write_pcds(folder: Path, poses: str) -> Path:
@@ -240,7 +249,7 @@ BREAK = {
 def test_a_wrong_folder_is_told_in_one_line_and_leaves_nothing(kitti_folder, tmp_path, what, message):
     BREAK[what](kitti_folder)
     with pytest.raises(ImportDriveError) as caught:
-        import_recording("kitti", kitti_folder, tmp_path / "a.mcap")
+        import_recording("kitti", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR, choices=STRICT)
     assert re.search(message, str(caught.value))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.glob("*.mcap*"))
@@ -263,8 +272,6 @@ def test_other_formats_tell_what_they_miss(tmp_path):
         with pytest.raises(ImportDriveError, match=message):
             import_recording(kind, tmp_path / "empty", tmp_path / "a.mcap")
     folder = write_pcds(tmp_path / "pcds", "1 2 3\n")
-    with pytest.raises(ImportDriveError, match="give --anchor"):
-        import_recording("pcd", folder, tmp_path / "a.mcap")
     with pytest.raises(ImportDriveError, match="1 lines of 3 numbers for 4 scans"):
         import_recording("pcd", folder, tmp_path / "a.mcap", anchor=ANCHOR)
 
@@ -278,12 +285,12 @@ def test_command_line(kitti_folder, tmp_path):
     assert drive_counts(out).scans == 3
 
 
-@pytest.mark.parametrize("anchor", ["37.56", "a,b,c", "1,2,3,4"])
+@pytest.mark.parametrize("anchor", ["37.56", "a,b,c", "1,2,3,4,5", "1,2,nan", "91,0,0"])
 def test_command_line_refuses_an_anchor_that_is_none(kitti_folder, tmp_path, anchor):
     arguments = ["kitti", str(kitti_folder), "-o", str(tmp_path / "a.mcap"), "--anchor", anchor]
     result = CliRunner().invoke(import_drives, arguments)
     assert isinstance(result.exception, GndError)
-    assert "expected LAT,LON,HEIGHT" in str(result.exception)
+    assert "LAT,LON,HEIGHT" in str(result.exception) or "latitude -90" in str(result.exception)
 
 
 def test_real_pcd_folder(shared_data, tmp_path):

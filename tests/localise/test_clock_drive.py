@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from clock_drives import ClockDrive, brisk_drive, driven
 
 from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise import localisation_error
-from studies.clock import ClockDrive, brisk_drive, driven
 
 SEED = 1207  # of no street on which anything was tuned
 

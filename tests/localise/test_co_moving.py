@@ -257,7 +257,7 @@ def test_rings_on_open_ground_are_no_odometry():
 def test_a_van_put_before_real_scans(shared_data, tmp_path):
     """Sixteen sweeps of an HDL-64E: of the van most points go, of the street next to none."""
     recording = open_recording("kitti", shared_data / "kitti00_start16")
-    write_drive(recording, map_track(recording), tmp_path / "alone.mcap")
+    write_drive(recording, map_track(recording), tmp_path / "alone.mcap", stand_ins=True)
     hits = put_behind_a_van(tmp_path / "alone.mcap", tmp_path / "van.mcap", VanAhead(13.0, swing_m=0.5))
     items, mount = list(read_drive(tmp_path / "van.mcap")), read_header(tmp_path / "van.mcap").T_vehicle_lidar
     motion, detector, before_ns, way_m = MotionBuffer(), CoMoving(mount), None, 0.0

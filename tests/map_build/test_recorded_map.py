@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from drifting_drives import MapDrift, drift_drive, relative_errors
 
 from gnd.deploy.map_cli import map_group
 from gnd.deploy.map_page import write_map_page
@@ -26,7 +27,6 @@ from gnd.vehicle_agent.map_build.quality import Quality, measure
 from gnd.vehicle_agent.map_build.refine_poses import refine_poses
 from gnd.vehicle_agent.map_build.result import summary
 from gnd.vehicle_agent.map_build.survey import look_over
-from studies.map_build import MapDrift, drift_drive, relative_errors
 
 SEED = 103
 PASSES = ((1, 11), (-1, 12))

@@ -9,12 +9,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import Detections, LaneLook, MotionTrack
 from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes
-from gnd.vehicle_agent.features.mapping.parameters import (
-    LaneParameters,
-    MappingGnssNoise,
-    MappingMotionNoise,
-    NewLayerParameters,
-)
+from gnd.vehicle_agent.features.mapping.sensors import DriveSensors, GnssReceiver, WheelsAndGyro
 
 T0_NS = 1_700_000_000_000_000_000
 
@@ -167,12 +162,8 @@ def _as_seen(at: F64, lane: F64, noise: Noise, rng: np.random.Generator) -> np.n
     return (xy @ np.array([[c, s], [-s, c]]) + [0.0, noise.lane_m * rng.standard_normal()]).astype(np.float32)
 
 
-def parameters(noise: Noise, rounds: int = 4) -> NewLayerParameters:
-    return NewLayerParameters(
-        rounds=rounds,
-        motion=MappingMotionNoise(
-            noise.scale or 1e-5, noise.wheel or 1e-3, noise.bias or 1e-6, noise.gyro or 1e-4, 1e-5, 0.0
-        ),
-        gnss=MappingGnssNoise(noise.gnss or 0.01, noise.tau_s, noise.white or 0.01),
-        lanes=LaneParameters(map_sigma_m=0.0),
-    )  # fmt: skip
+def sensors(noise: Noise) -> DriveSensors:
+    return DriveSensors(
+        WheelsAndGyro(noise.scale or 1e-5, noise.wheel or 1e-3, noise.bias or 1e-6, noise.gyro or 1e-4, 1e-5, 0.0),
+        GnssReceiver(noise.gnss or 0.01, noise.tau_s, noise.white or 0.01),
+    )

@@ -4,11 +4,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gnd.vehicle_agent.features.mapping import graph
 from gnd.vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
 from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps
 from gnd.vehicle_agent.features.mapping.graph import solve
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, PoseMatches, Problem, State
-from gnd.vehicle_agent.features.mapping.parameters import MappingGnssNoise, NewLayerParameters
+from gnd.vehicle_agent.features.mapping.sensors import SERIES_CAR, GnssReceiver
 
 
 def precision(t_s, sigma, tau):
@@ -37,7 +38,7 @@ def test_with_equal_steps_the_precision_is_the_one_of_ar1():
     np.testing.assert_allclose(gauss_markov_springs(t_s, sigma, tau).prior[1:-1], (1.0 - phi) ** 2 / q)
 
 
-def test_poses_of_a_standing_vehicle_are_the_generalised_mean_of_its_fixes():
+def test_poses_of_a_standing_vehicle_are_the_generalised_mean_of_its_fixes(monkeypatch):
     """With the poses tied together, the graph weighs fixes by the dense covariance of the process: numpy's answer."""
     n, sigma, tau, white = 8, 2.0, 5.0, 0.3
     xy = np.random.default_rng(1).normal([40.0, -7.0], 2.0, (n, 2))
@@ -48,7 +49,8 @@ def test_poses_of_a_standing_vehicle_are_the_generalised_mean_of_its_fixes():
     still = Steps(np.zeros((n - 1, 3)), np.zeros((n - 1, 3, 2)), np.broadcast_to(1e-6 * np.eye(3), (n - 1, 3, 3)))
     fixes = FixNodes(np.arange(n), t_s, xy, np.full(n, white**2))
     start = State(np.zeros((n, 3)), np.empty((0, 2)), np.zeros(2))
-    noise = NewLayerParameters(gnss=MappingGnssNoise(sigma, tau, white, robust_k=1e6))
+    monkeypatch.setattr(graph, "ROBUST_K", 1e6)
+    noise = replace(SERIES_CAR, gnss=GnssReceiver(sigma, tau, white))
     told = _heading_told(Problem(still, np.zeros(2), fixes))
     solution = solve(told, start, noise)
     np.testing.assert_allclose(solution.state.pose[:, :2], np.broadcast_to(expected, (n, 2)), atol=3e-3)
@@ -58,4 +60,4 @@ def test_poses_of_a_standing_vehicle_are_the_generalised_mean_of_its_fixes():
 
 def _heading_told(problem):
     heading = PoseMatches(np.array([0]), np.zeros((1, 3)), np.zeros((1, 3)), np.diag([0.0, 0.0, 1e8])[None])
-    return replace(problem, poses=heading)
+    return replace(problem, lanes=heading)

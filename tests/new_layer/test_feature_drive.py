@@ -1,5 +1,6 @@
-"""A recording as the mapping sees it, and parameters that cannot be."""
+"""A recording as the mapping sees it, and sensors that cannot be."""
 
+from dataclasses import replace
 from math import radians
 
 import numpy as np
@@ -9,13 +10,7 @@ from plane_scene import Noise, Scene, drive
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.schemas.drive import GnssFix, MotionSample
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
-from gnd.vehicle_agent.features.mapping.parameters import (
-    LandmarkParameters,
-    LaneParameters,
-    MappingGnssNoise,
-    MappingMotionNoise,
-    NewLayerParameters,
-)
+from gnd.vehicle_agent.features.mapping.sensors import SERIES_CAR
 
 FRAME = LocalFrame(radians(37.45), radians(127.12), 60.0)
 
@@ -37,24 +32,15 @@ def truth():
 def test_looks_of_another_layer_or_sensor_are_not_taken(truth):
     items = items_of(drive(truth, Noise(), 0))
     assert FeatureDrive.of_items(items, FRAME, "signs").looks == ()
-    assert FeatureDrive.of_items(items, FRAME, "streetlights", "camera").looks == ()
-    both = FeatureDrive.of_items(items, FRAME, "streetlights", "lidar")
+    both = FeatureDrive.of_items(items, FRAME, "streetlights")
     assert len(both.looks) == 81
     assert len(both.lanes) == 81
     np.testing.assert_allclose(both.fixes.xy_m, truth.pose[::50, :2], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("kind", "field", "value"),
-    [
-        (MappingMotionNoise, "wheel_scale", 0.0),
-        (MappingMotionNoise, "slip_rad", -1.0),
-        (MappingGnssNoise, "correlation_s", 0.0),
-        (LandmarkParameters, "robust_k", 0.0),
-        (LaneParameters, "map_sigma_m", -1.0),
-        (NewLayerParameters, "rounds", 0),
-    ],
-)
-def test_parameters_that_cannot_be_are_refused(kind, field, value):
+@pytest.mark.parametrize(("part", "field", "value"), [
+    ("motion", "wheel_scale", 0.0), ("motion", "slip_rad", -1.0), ("gnss", "correlation_s", 0.0)
+])  # fmt: skip
+def test_sensors_that_cannot_be_are_refused(part, field, value):
     with pytest.raises(ValueError, match=field):
-        kind(**{field: value})
+        replace(getattr(SERIES_CAR, part), **{field: value})

@@ -3,9 +3,9 @@ import pytest
 
 from gnd.schemas.drive import MotionTrack
 from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative
-from gnd.vehicle_agent.features.mapping.parameters import MappingMotionNoise
+from gnd.vehicle_agent.features.mapping.sensors import SERIES_CAR, WheelsAndGyro
 
-NOISE = MappingMotionNoise()
+NOISE = SERIES_CAR.motion
 
 
 def wavy(seed=0, n=400):
@@ -46,7 +46,7 @@ def test_jacobians_are_the_slopes_of_the_steps():
 def test_covariance_is_that_of_many_drives_with_white_noise():
     track, rng = wavy(), np.random.default_rng(1)
     keys = track.t_ns[[0, 100]]
-    noise = MappingMotionNoise(wheel_mps=0.5, gyro_radps=0.05, slip_m=1e-6, slip_rad=0.0)
+    noise = WheelsAndGyro(0.005, 0.5, 0.002, 0.05, 1e-6, 0.0)
     steps = DeadReckoning.of(track, noise, 0.0, 0.0).steps(keys)
     ends = []
     for _ in range(800):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plane_scene import PAPER, Scene, drive, parameters
+from plane_scene import PAPER, Scene, drive, sensors
 
 from gnd.schemas.drive import MotionTrack
 from gnd.vehicle_agent.features.mapping.feature_drive import GnssFixes
@@ -16,7 +16,7 @@ TRUTH = SCENE.truth()
 
 def mapped(changed, with_lanes: bool = False, shift_m: float = 0.0) -> NewLayer:
     lanes = lane_map([lane + np.array([0.0, shift_m]) for lane in TRUTH.lanes]) if with_lanes else None
-    return map_new_layer(changed, parameters(PAPER, rounds=2), lanes)
+    return map_new_layer(changed, sensors(PAPER), lanes, rounds=2)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from plane_scene import Noise, Scene, drive, parameters
+from plane_scene import Noise, Scene, drive, sensors
 
 from gnd.gnd_map.errors import ShapeError
 from gnd.vehicle_agent.errors import NewLayerError
@@ -60,9 +60,8 @@ def test_gicp_says_nothing_where_there_is_no_lane():
 
 def matches(bend, noise=SHARP, start=(0.0, 0.0, 0.0), search=False, polish=False, seed=1):
     truth = Scene(bend=bend).truth()
-    p = parameters(noise)
-    nodes = DriveNodes.of(drive(truth, noise, seed), p)
-    matcher = LaneMatcher(LaneMap.of(truth.lanes), nodes.drive.lanes, nodes, p.lanes)
+    nodes = DriveNodes.of(drive(truth, noise, seed), sensors(noise))
+    matcher = LaneMatcher(LaneMap.of(truth.lanes), nodes.drive.lanes, nodes)
     matcher._searched = not search
     true = truth.at(nodes.t_ns)
     pose = composed(true, np.broadcast_to(np.array(start), true.shape))
@@ -127,7 +126,7 @@ def test_polylines_of_a_look_keep_their_order():
     column, cost = choices(lines, o, np.zeros(1))
     assert column[:, 0].tolist() == [2, 0]
     assert cost[0, 0] == pytest.approx((0.15**2 + 0.25**2) / (1.0 + 0.3**2), rel=0.01)
-    np.testing.assert_allclose(o.told[[0, 1], column[:, 0]], [[-0.15, 0.0], [0.25, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(o.residual[[0, 1], column[:, 0]], [[-0.15, 0.0], [0.25, 0.0]], atol=1e-6)
 
 
 def test_more_polylines_than_lanes_leaves_one_over():

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from plane_scene import PAPER, Scene, drive, parameters
+from plane_scene import PAPER, Scene, drive, sensors
 from scipy.stats import chi2
 
 from gnd.vehicle_agent.features.mapping.new_layer import lane_map, map_new_layer
@@ -21,7 +21,7 @@ def errors(with_lanes):
     lanes = lane_map(truth.lanes) if with_lanes else None
     squares, off = np.empty((RUNS, 2)), np.empty((RUNS, 2, 2))
     for seed in range(RUNS):
-        layer = map_new_layer(drive(truth, PAPER, FIRST_SEED[with_lanes] + seed), parameters(PAPER, rounds=1), lanes)
+        layer = map_new_layer(drive(truth, PAPER, FIRST_SEED[with_lanes] + seed), sensors(PAPER), lanes, rounds=1)
         distance = np.hypot(*(layer.features.xy_m[:, None] - truth.features[None]).transpose(2, 0, 1))
         row = np.argmin(distance, axis=0)
         off[seed] = layer.features.xy_m[row] - truth.features

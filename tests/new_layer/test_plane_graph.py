@@ -3,24 +3,24 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.optimize import least_squares
 
-from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps, composed, relative, wrapped
+from gnd.vehicle_agent.features.mapping import graph
+from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps, composed, relative
 from gnd.vehicle_agent.features.mapping.graph import root_of, solve
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, GraphAnchors, PoseMatches, Problem, State, Ties
-from gnd.vehicle_agent.features.mapping.parameters import (
-    LandmarkParameters,
-    LaneParameters,
-    MappingGnssNoise,
-    NewLayerParameters,
-)
+from gnd.vehicle_agent.features.mapping.sensors import SERIES_CAR, GnssReceiver
+from gnd.vehicle_agent.features.view import wrapped
 
 K, N = 6, 3
-QUIET = NewLayerParameters(  # no edge is far enough off for Huber to matter
-    gnss=MappingGnssNoise(sigma_m=2.0, correlation_s=8.0, robust_k=1e6),
-    landmarks=LandmarkParameters(robust_k=1e6),
-    lanes=LaneParameters(robust_k=1e6),
-)
+QUIET = replace(SERIES_CAR, gnss=GnssReceiver(2.0, 8.0, 1.0))
+
+
+@pytest.fixture(autouse=True)
+def no_outliers(monkeypatch):
+    """No edge is far enough off for Huber to matter."""
+    monkeypatch.setattr(graph, "ROBUST_K", 1e6)
 
 
 def problem():

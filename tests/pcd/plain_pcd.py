@@ -9,6 +9,8 @@ from collections import defaultdict
 
 import numpy as np
 
+from studies.pcd import points as rules
+
 SIDE = 5
 
 
@@ -30,7 +32,7 @@ class PlainPcd:
     """Counts as `PcdDetector` does, with the meaning of its parameters."""
 
     def __init__(self, detector) -> None:
-        self.index, self.p = detector.index, detector.parameters
+        self.index = detector.index
         base = self.index.base
         self.shape = np.array(base.shape)
         self.points, self.normals = base.point_m.astype(float), base.normal.astype(float)
@@ -49,9 +51,9 @@ class PlainPcd:
 
     def ray(self, o, p, g0, g1, moves) -> None:
         length = float(np.linalg.norm(p - o))
-        if length <= self.p.range_min_m:
+        if length <= rules.RANGE_M[0]:
             return
-        first, last = self._clip(g0, g1 - g0, min(1.0, self.p.range_max_m / length))
+        first, last = self._clip(g0, g1 - g0, min(1.0, rules.RANGE_M[1] / length))
         if first >= last:
             return
         blocks = list(stretches(g0, g1, first, last, SIDE))
@@ -74,21 +76,21 @@ class PlainPcd:
         u = self.cell.get(cell)
         if u is not None:
             self.passes[u] += self._has_passed(u, t_in, t_out, o, v, length)
-        elif tuple(c // SIDE for c in cell) in self.new_blocks and (1.0 - t_out) * length > self.p.ahead_m:
+        elif tuple(c // SIDE for c in cell) in self.new_blocks and (1.0 - t_out) * length > rules.AHEAD_M:
             self.new_passes[cell] += 1
 
     def _has_passed(self, u, t_in, t_out, o, v, length) -> bool:
         n, w = self.normals[u], self.points[u] - o
         if n.any():
             t = (n @ w) / (n @ v)
-            return t_in <= t <= t_out and (1.0 - t) * abs(n @ v) > self.p.beyond_m
+            return t_in <= t <= t_out and (1.0 - t) * abs(n @ v) > rules.BEYOND_M
         t = (w @ v) / (v @ v)
-        return (1.0 - t) * length > self.p.ahead_m and np.linalg.norm(w - t * v) <= self.p.beside_m
+        return (1.0 - t) * length > rules.AHEAD_M and np.linalg.norm(w - t * v) <= rules.BESIDE_M
 
     def _distance(self, u, p) -> float:
         d, n = p - self.points[u], self.normals[u]
         away = abs(d @ n) if n.any() else np.linalg.norm(d)
-        return float(d @ d) if away <= self.p.near_m else np.inf
+        return float(d @ d) if away <= rules.NEAR_M else np.inf
 
     def _end(self, p, cell) -> None:
         for reach in (0, 1, 2):

@@ -4,7 +4,7 @@ from pcd_world import scans
 from plain_pcd import PlainPcd
 
 from gnd.gnd_map.errors import ShapeError
-from studies.pcd import PcdDetector, PcdDetectParameters, PcdError, PcdMap
+from studies.pcd import PcdDetector, PcdError, PcdMap
 from studies.pcd.detector import box_sums
 from studies.pcd.index import index_of
 from studies.pcd.kernel import EMPTY, support_sums, surface_normals
@@ -116,8 +116,3 @@ def test_a_map_without_points_is_refused(cloud):
         PcdDetector(PcdMap(np.empty((0, 3), np.float32), cloud.frame))
     with pytest.raises(PcdError, match="float32"):
         PcdMap(np.zeros((2, 3)), cloud.frame)  # type: ignore[arg-type]
-
-
-def test_parameters_outside_their_range_are_refused():
-    with pytest.raises(PcdError, match=r"near_m = -0\.1"):
-        PcdDetectParameters(near_m=-0.1)

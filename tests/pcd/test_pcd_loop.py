@@ -9,7 +9,7 @@ from pcd_world import COMES, GOES, PLAN, STAYS, inside
 from gnd.fleet_sim.evaluate import evaluate_maps
 from gnd.fleet_sim.truth import grid_of, make_truth
 from gnd.gnd_map.similarity import similarity
-from studies.pcd import PcdError, PcdMap, PcdMergeParameters, evaluate_gnd, gnd_of, merge_pcd, settled
+from studies.pcd import PcdError, PcdMap, evaluate_gnd, gnd_of, merge_pcd, settled
 from studies.pcd.merge import count_votes
 from studies.pcd.points import cell_keys, cells_of, downsample, key_cells
 
@@ -74,7 +74,7 @@ def test_the_order_of_reports_does_not_matter(cloud, reports):
 def test_one_of_three_decides_nothing_where_two_saw_nothing(cloud, reports):
     r = reports[0]
     quiet = type(r)(r.new_points[:0], r.deleted_index[:0], r.observed, r.map_size)
-    merged = merge_pcd(cloud, [r, quiet, quiet], PcdMergeParameters(xi=0.5))
+    merged = merge_pcd(cloud, [r, quiet, quiet])
     np.testing.assert_array_equal(merged.points_m, cloud.points_m)
 
 

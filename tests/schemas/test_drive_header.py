@@ -9,7 +9,7 @@ import pytest
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.schemas.drive import DriveHeader, MountSigma
 from gnd.schemas.drive_metadata import header_of, metadata_of
-from gnd.schemas.errors import BadValue, DriveError
+from gnd.schemas.errors import BadValue, DriveError, NoPlace
 from gnd.schemas.sweep_distortion import distortion_sigma
 
 OLD = DriveHeader("drive-1", "car-1", "VLP-16", LocalFrame(0.6555, 2.2172, 30.25), np.eye(4), "made by a test")
@@ -36,9 +36,23 @@ def test_what_is_said_is_read_back(deskew, mount, sigma):
     assert header_of(metadata_of(header), np.eye(4)) == header
 
 
+@pytest.mark.parametrize("nowhere", [False, True])
+@pytest.mark.parametrize("stand_ins", [(), ("gnss",), ("gnss", "motion")])
+def test_place_and_stand_ins_are_read_back(nowhere, stand_ins):
+    header = dataclasses.replace(OLD, nowhere=nowhere, stand_ins=stand_ins)
+    assert (header == OLD) == (not nowhere and not stand_ins)
+    assert header_of(metadata_of(header), np.eye(4)) == header
+    if nowhere:
+        with pytest.raises(NoPlace, match="--nowhere"):
+            header.check_placed()
+    else:
+        header.check_placed()
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
+        {"stand_ins": ("wheels",)},
         {"deskew": "yes"},
         {"mount": "by hand"},
         {"sweep_ns": -1},

@@ -4,7 +4,6 @@ from typing import Any
 
 from studies.localisation_study import series as reference
 from studies.localisation_study.summary import ROWS, update_ratio
-from studies.localisation_study.variants import VARIANTS
 
 START = {"trials": 40, "right": 39, "right_share": 0.975, "never_good": 1, "wrong_called_good": 0}
 
@@ -24,7 +23,6 @@ def sensor(**rows: dict[str, Any]) -> dict[str, Any]:
     found = {name: row(0.01, 0.01, 0.02) for name in ROWS} | rows
     found["update_ratio"] = update_ratio(found)
     found["reinitialisation"] = START | {"good_after_s": {"p50": 0.2, "p95": 1.0}}
-    found["variants"] = {name: row(0.02, 0.02, 0.03) for name in VARIANTS}
     return found
 
 

@@ -7,15 +7,7 @@ from click.testing import CliRunner
 
 from studies.__main__ import NAMES, alone
 
-WITH_OPTIONS = {
-    "codec": "--store",
-    "return-download": "--seed",
-    "gnss-noise": "--recording",
-    "poles": "--sensors",
-    "slamcu-step": "--particles",
-    "short-reports": "--length",
-    "camera-pipeline": "--km",
-}
+WITH_OPTIONS = {"poles": "--sensors"}
 
 
 @pytest.mark.parametrize("name", NAMES)

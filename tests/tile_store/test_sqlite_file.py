@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -17,7 +16,6 @@ from gnd.tile_store.errors import StoreBusy, StoreClosed, StoreError, StoreUnava
 from gnd.tile_store.migrations import APPLICATION_ID, SCHEMA_VERSION
 from gnd.tile_store.sqlite_connection import open_writer
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.values import StoreConfig
 
 
 def opens_as(path: Path, **options: bool) -> str:
@@ -143,9 +141,12 @@ def test_several_openers_of_a_new_store_make_it_once(tmp_path: Path) -> None:
         assert store.counts().reports == 8
 
 
-def test_a_writer_that_waits_too_long_says_so_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_a_writer_that_waits_too_long_says_so_and_nothing_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gnd.tile_store.sqlite_store.BUSY_TIMEOUT_S", 0.05)
     path = tmp_path / "s.db"
-    with SqliteStore(path, StoreConfig(busy_timeout_s=0.05)) as store:
+    with SqliteStore(path) as store:
         other = apsw.Connection(str(path))
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreBusy, match="write lock"):
@@ -157,7 +158,7 @@ def test_a_writer_that_waits_too_long_says_so_and_nothing_is_lost(tmp_path: Path
 
 def test_readers_do_not_wait_for_a_writer(tmp_path: Path) -> None:
     path = tmp_path / "s.db"
-    with SqliteStore(path, StoreConfig(busy_timeout_s=0.05)) as store:
+    with SqliteStore(path) as store:
         store.put_tiles([tile_of_voxels(TILE, 1)])
         other = apsw.Connection(str(path))
         other.execute("BEGIN IMMEDIATE")
@@ -316,9 +317,9 @@ def test_who_is_interrupted_while_it_writes_for_others_leaves_nobody_waiting(tmp
         assert store.counts().reports == 2  # nothing was deleted, nothing half written
 
 
-def test_many_threads_take_turns_at_writing(tmp_path: Path) -> None:
-    config = replace(EAGER, group_max=3)
-    with SqliteStore(tmp_path / "s.db", config) as store:
+def test_many_threads_take_turns_at_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gnd.tile_store.sqlite_store.GROUP_MAX", 3)
+    with SqliteStore(tmp_path / "s.db", EAGER) as store:
 
         def work(first: int) -> None:
             for number in range(first, first + 40):

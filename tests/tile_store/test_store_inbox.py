@@ -134,11 +134,9 @@ def test_quarantine_keeps_bytes_reason_and_count(store: Store, clock: Clock) -> 
     "bad",
     [
         {"merge_delay_s": -1.0},
-        {"busy_timeout_s": 0.0},
         {"window_s": 0.0},
         {"window_vehicles": 0},
         {"window_reports": 0},
-        {"group_max": 0},
     ],
 )
 def test_a_configuration_that_cannot_work_is_refused(bad: dict[str, float]) -> None:

@@ -7,12 +7,13 @@ from math import atan2, hypot, radians
 import numpy as np
 
 from gnd.vehicle_agent.features.look import Look, MapFeatures
-from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
+from gnd.vehicle_agent.features.slamcu import noise
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.view import CAMERA, Occlusion
 
 PERIOD_S = 1.0 / 15.0
-FEW = SlamcuParameters(filter=FilterParameters(particles=300))
+FEW = SlamcuParameters(particles=300)
 NO_SHIFT = np.zeros(2)
 CERTAIN = np.diag([1e-6, 1e-6, 1e-10])
 
@@ -82,13 +83,12 @@ def driven(
     start = np.array([road.start_m, 0.0, 0.0])
     off = np.zeros(3) if given else np.linalg.cholesky(cov0 + 1e-18 * np.eye(3)) @ rng.standard_normal(3)
     slamcu = Slamcu(parameters, road.known(), start + off, cov0, seed)
-    motion = parameters.motion
-    scale, bias = motion.scale * rng.standard_normal(), motion.bias_radps * rng.standard_normal()
+    scale, bias = noise.SCALE * rng.standard_normal(), noise.BIAS_RADPS * rng.standard_normal()
     for i, pose in road.poses():
         if given:
             slamcu.set_pose(pose, cov0)
         elif i:
-            way, turn = np.sqrt(PERIOD_S) * np.array([motion.speed_m, motion.yaw_rad]) * rng.standard_normal(2)
+            way, turn = np.sqrt(PERIOD_S) * np.array([noise.SPEED_M, noise.YAW_RAD]) * rng.standard_normal(2)
             speed = (road.speed_mps + way / PERIOD_S) / (1.0 + scale)
             slamcu.predict(PERIOD_S, speed, bias + turn / PERIOD_S)
         slamcu.look(road.look(i, pose, rng, hidden=hidden), CAMERA, occlusion)

@@ -24,7 +24,8 @@ from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.sources.recording import first_fix
-from studies.camera_pipeline import WholeLayer
+from studies.feature_study.pipelines import TilesAtOnce
+from studies.slamcu_study.driving import sign_tiles
 
 SEED, LENGTH_M = 31, 6000.0
 WHO = Identity("car", "drive", "none", "signs")
@@ -43,7 +44,10 @@ def driven() -> RoadDrive:
 
 def reports_of(drive: RoadDrive) -> tuple[CameraPipeline, list[FeatureReport]]:
     fix, items = first_fix(items_of(drive), "drive")
-    pipeline, reports = CameraPipeline(fix, SIGNS, WHO, feature_tiles=WholeLayer(drive)), []
+    pipeline, reports = (
+        CameraPipeline(fix, SIGNS, WHO, feature_tiles=TilesAtOnce({"signs": sign_tiles(drive.route).values()})),
+        [],
+    )
     for item in items:
         reports += pipeline.push(item).reports
     reports += pipeline.finish().reports
@@ -68,7 +72,7 @@ def test_signs_are_judged_and_found_by_the_filters_own_poses() -> None:
     assert len(wrong) <= 1
     assert abs(found - sum(state == "new" for state in truth.values())) <= 2
     assert pipeline.slamcu is not None
-    assert not [lost for lost in pipeline.slamcu.lost if not lost.told_anew]
+    assert not [lost for lost in pipeline.slamcu.lost if not lost.replayed]
 
 
 @pytest.mark.slow
@@ -84,7 +88,7 @@ def test_a_gnss_that_is_beside_itself_takes_back_and_calls_no_map_wrong() -> Non
     called_gone = [one for one, there in seen.items() if not there and truth[one] != "deleted"]
     assert len(called_gone) <= 1
     assert pipeline.slamcu is not None
-    said_lost = any(not lost.told_anew for lost in pipeline.slamcu.lost)
+    said_lost = any(not lost.replayed for lost in pipeline.slamcu.lost)
     assert said_lost or pipeline.slamcu.fixes_refused > 100
 
 
@@ -125,7 +129,7 @@ def test_it_needs_one_layer_that_a_camera_looks_for() -> None:
 def test_the_agent_drives_it_over_the_bus(bus: Bus, endpoint: str, tmp_path: Path) -> None:
     path = write_road_drive(driven(), "camera-car", tmp_path / "drive.mcap")
     with SqliteStore(tmp_path / "store.sqlite") as store, TileServer(store, bus):
-        store.put_tiles([tile for _, tile in WholeLayer(driven()).follow(None)], layer="signs")
+        store.put_tiles(list(sign_tiles(driven().route).values()), layer="signs")
         config = AgentConfig(
             vehicle="camera-car",
             drive=path,

@@ -20,12 +20,12 @@ from gnd.schemas.errors import SchemaError
 from gnd.schemas.keys import batch_key
 from gnd.schemas.tiles import blob_of
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
+from gnd.tile_client.exchange import Exchange, shares_of
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.link.download import TileFetcher
-from gnd.vehicle_agent.link.exchange import Exchange, shares_of
 
 LARGE = 1 << 20
 

@@ -8,13 +8,11 @@ import pytest
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.feature_change import GRID, cell_of
-from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
-from gnd.vehicle_agent.features.errors import FeatureLayerError
+from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.view import CAMERA, LIDAR, Occlusion
 
 START = TileId.from_path("13033/03021/23031/22102")
 FRAME = LocalFrame.of_tile(START)
-ONCE = CoverageParameters(looks=1)
 
 
 def place_of(tile: TileId, cell: int) -> np.ndarray:
@@ -37,7 +35,7 @@ def cells(coverage: Coverage) -> dict[tuple[TileId, int], np.ndarray]:
 
 @pytest.mark.parametrize("heading_deg", [0.0, 77.0, -150.0])
 def test_the_cells_in_view_are_those_whose_middle_lies_in_the_field_of_view(heading_deg: float) -> None:
-    coverage, heading = Coverage(FRAME, CAMERA, 2.0, ONCE), radians(heading_deg)
+    coverage, heading = Coverage(FRAME, CAMERA, 2.0, looks=1), radians(heading_deg)
     x, y = 400.0, -250.0
     coverage.look(x, y, heading, None)
     seen = cells(coverage)
@@ -51,7 +49,7 @@ def test_the_cells_in_view_are_those_whose_middle_lies_in_the_field_of_view(head
 
 
 def test_a_cell_counts_after_looks_from_several_places() -> None:
-    coverage = Coverage(FRAME, LIDAR, 2.0, CoverageParameters(looks=3, step_m=1.0))
+    coverage = Coverage(FRAME, LIDAR, 2.0, looks=3)
     moved = [coverage.look(x, 0.0, 0.0, None) for x in (0.0, 0.3, 1.0, 1.5)]
     assert moved == [True, False, True, False]
     assert not cells(coverage)
@@ -61,7 +59,7 @@ def test_a_cell_counts_after_looks_from_several_places() -> None:
 
 def test_what_is_hidden_is_not_looked_at() -> None:
     free = np.where(np.arange(360) < 180, 10.0, np.inf)  # all to the right is hidden beyond 10 m
-    coverage = Coverage(FRAME, LIDAR, 2.0, ONCE)
+    coverage = Coverage(FRAME, LIDAR, 2.0, looks=1)
     coverage.look(0.0, 0.0, 0.0, Occlusion.of_ranges(free, -pi, radians(1.0)))
     places = np.array(list(cells(coverage).values()))
     right = places[:, 1] < -0.5
@@ -70,13 +68,8 @@ def test_what_is_hidden_is_not_looked_at() -> None:
 
 
 def test_a_tile_that_was_reported_is_forgotten() -> None:
-    coverage = Coverage(FRAME, LIDAR, 2.0, ONCE)
+    coverage = Coverage(FRAME, LIDAR, 2.0, looks=1)
     coverage.look(0.0, 0.0, 0.0, None)
     assert coverage.viewed(START) == 2**64 - 1
     coverage.forget(START)
     assert coverage.viewed(START) == 0
-
-
-def test_parameters_that_cannot_work_are_refused() -> None:
-    with pytest.raises(FeatureLayerError, match="looks = 0 lies outside"):
-        CoverageParameters(looks=0)

@@ -8,8 +8,9 @@ import pytest
 from test_feature_layer import FRAME, GONE, NEW, STANDS, look_from, mapped
 
 from gnd.schemas.drive import Detections
+from gnd.schemas.feature_layer import LAYERS
 from gnd.vehicle_agent.config import ReportParameters
-from gnd.vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.layers import FeatureLayers
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan

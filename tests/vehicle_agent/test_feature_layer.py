@@ -10,12 +10,12 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.se3 import exp_so3
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Detections
+from gnd.schemas.errors import LayerError
+from gnd.schemas.feature_layer import LAYERS, LayerParameters
 from gnd.schemas.features import FeatureChange
-from gnd.vehicle_agent.features.coverage import CoverageParameters
-from gnd.vehicle_agent.features.errors import FeatureLayerError
 from gnd.vehicle_agent.features.feature_map import place_in_tile
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, of_counts
-from gnd.vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters, LayerParameters
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.layers import placed
 from gnd.vehicle_agent.features.look import Look
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
@@ -50,7 +50,7 @@ def look_from(x: float, rng: np.random.Generator, t_ns: int) -> PlacedLook:
 
 @pytest.fixture(scope="module")
 def changes() -> dict[TileId, FeatureChange]:
-    layer = FeatureLayer(LAYERS["signs"], CoverageParameters(), FRAME)
+    layer = FeatureLayer(LAYERS["signs"], FRAME)
     for tile in mapped(STANDS, GONE):
         assert layer.hold(tile)
     rng = np.random.default_rng(3)
@@ -94,7 +94,7 @@ def test_heights_are_those_of_the_map_on_a_slope() -> None:
     slope, sign = 0.02, np.array([80.0, 4.0, 80.0 * 0.02 + 2.0])
     T = np.eye(4)
     T[:3, :3] = exp_so3(np.array([0.0, -np.arctan(slope), 0.0]))
-    layer = FeatureLayer(LAYERS["signs"], CoverageParameters(), FRAME)
+    layer = FeatureLayer(LAYERS["signs"], FRAME)
     for x in np.arange(10.0, 60.0, 0.5):
         T[:3, 3] = x, 0.0, slope * x
         ahead, left, height = (np.float32(v) for v in T[:3, :3].T @ (sign - T[:3, 3]))
@@ -120,7 +120,7 @@ def test_the_report_says_where_the_drive_has_looked_and_what_it_compared_with(
 
 
 def test_a_newer_version_waits_while_there_is_evidence_against_the_old_one() -> None:
-    layer = FeatureLayer(LAYERS["signs"], CoverageParameters(), FRAME)
+    layer = FeatureLayer(LAYERS["signs"], FRAME)
     (old,), (new,) = mapped(STANDS), mapped((STANDS[0] + 0.1, STANDS[1]))
     assert layer.hold(old)
     assert layer.hold(new)
@@ -130,7 +130,7 @@ def test_a_newer_version_waits_while_there_is_evidence_against_the_old_one() -> 
 
 
 def test_what_was_left_is_forgotten() -> None:
-    layer = FeatureLayer(LAYERS["signs"], CoverageParameters(), FRAME)
+    layer = FeatureLayer(LAYERS["signs"], FRAME)
     for tile in mapped(STANDS):
         layer.hold(tile)
     layer.see(look_from(20.0, np.random.default_rng(0), 0), None)
@@ -156,9 +156,9 @@ def test_masses_of_very_many_looks_do_not_underflow() -> None:
 
 
 def test_layers_that_cannot_be_are_refused_by_name() -> None:
-    with pytest.raises(FeatureLayerError, match="trees"):
+    with pytest.raises(LayerError, match="trees"):
         FeatureParameters.of("signs", "trees")
-    with pytest.raises(FeatureLayerError, match="ndt2"):
+    with pytest.raises(LayerError, match="ndt2"):
         LayerParameters("ndt2", "camera", ("traffic_sign",))
-    with pytest.raises(FeatureLayerError, match="twice"):
+    with pytest.raises(LayerError, match="twice"):
         FeatureParameters((LAYERS["signs"], LAYERS["signs"]))

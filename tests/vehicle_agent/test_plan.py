@@ -130,7 +130,6 @@ def test_batches_suit_the_link() -> None:
     [
         ({"near_m": 100.0}, "near_m = 100.0"),
         ({"ahead_m": -1.0}, "ahead_m = -1.0"),
-        ({"ahead_s": 5.0}, "ahead_s = 5.0"),
         ({"in_flight": 65}, "in_flight = 65"),
     ],
 )

@@ -7,6 +7,7 @@ from math import exp, radians, sqrt
 import numpy as np
 import pytest
 
+from gnd.vehicle_agent.features.slamcu import noise
 from gnd.vehicle_agent.features.slamcu.blind import BlindBelief
 from gnd.vehicle_agent.features.slamcu.hindsight import (
     GATE_SURE,
@@ -17,7 +18,6 @@ from gnd.vehicle_agent.features.slamcu.hindsight import (
     held,
     speaks_against,
 )
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 SIGMA_M = 2.12
 DT_S = 0.1
@@ -35,13 +35,13 @@ class Driven:
 
 @lru_cache(maxsize=64)
 def driven(seed: int, gap_s: tuple[float, float] = (0.0, 0.0)) -> Driven:
-    p, rng = SlamcuParameters(), np.random.default_rng([seed, 6])
-    slow_m, white_m = sqrt(1.0 - p.gnss.white_share) * SIGMA_M, sqrt(p.gnss.white_share) * SIGMA_M
+    rng = np.random.default_rng([seed, 6])
+    slow_m, white_m = sqrt(1.0 - noise.GNSS_WHITE_SHARE) * SIGMA_M, sqrt(noise.GNSS_WHITE_SHARE) * SIGMA_M
     cov0 = np.diag([4.0, 4.0, radians(1.0) ** 2])
     true = np.zeros(3)
-    hindsight = Hindsight(p, BlindBelief.first(np.sqrt(np.diag(cov0)) * rng.standard_normal(3), cov0, p))
-    scale, bias = p.motion.scale * rng.standard_normal(), p.motion.bias_radps * rng.standard_normal()
-    error, fade = slow_m * rng.standard_normal(2), exp(-1.0 / p.gnss.correlation_s)
+    hindsight = Hindsight(BlindBelief.first(np.sqrt(np.diag(cov0)) * rng.standard_normal(3), cov0))
+    scale, bias = noise.SCALE * rng.standard_normal(), noise.BIAS_RADPS * rng.standard_normal()
+    error, fade = slow_m * rng.standard_normal(2), exp(-1.0 / noise.GNSS_CORRELATION_S)
     path = []
     for i in range(2000):
         if i % 10 == 0:
@@ -49,8 +49,8 @@ def driven(seed: int, gap_s: tuple[float, float] = (0.0, 0.0)) -> Driven:
                 hindsight.fix(true[:2] + error + white_m * rng.standard_normal(2), SIGMA_M)
             error = fade * error + sqrt(1.0 - fade**2) * slow_m * rng.standard_normal(2)
         path.append(true.copy())
-        way = 25.0 * DT_S + p.motion.speed_m * sqrt(DT_S) * rng.standard_normal()
-        turn = 0.01 * DT_S + p.motion.yaw_rad * sqrt(DT_S) * rng.standard_normal()
+        way = 25.0 * DT_S + noise.SPEED_M * sqrt(DT_S) * rng.standard_normal()
+        turn = 0.01 * DT_S + noise.YAW_RAD * sqrt(DT_S) * rng.standard_normal()
         middle = true[2] + 0.5 * turn
         true += np.array([way * np.cos(middle), way * np.sin(middle), turn])
         hindsight.predict(DT_S, 25.0 / (1.0 + scale), 0.01 + bias)

@@ -9,8 +9,9 @@ from sign_road import CERTAIN, FEW, PERIOD_S, Road, driven
 
 from gnd.vehicle_agent.features.errors import BadLook, BadMapFeatures, BadPose
 from gnd.vehicle_agent.features.look import Look, MapFeatures
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
+from gnd.vehicle_agent.features.slamcu import track_management
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.features.view import CAMERA, Occlusion
 
 NORMAL, DELETED, NEW = FeatureClass.NORMAL, FeatureClass.DELETED, FeatureClass.NEW
@@ -135,13 +136,13 @@ def test_normal_signs_tell_where_the_vehicle_is_and_deleted_ones_do_not() -> Non
     assert sigmas[1] > 3.0
 
 
-def test_a_vehicle_that_comes_back_is_told_its_place_by_what_it_found() -> None:
+def test_a_vehicle_that_comes_back_is_told_its_place_by_what_it_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """New features are used once they exist: also those that it has long settled."""
     road = Road(standing=[LEFT, RIGHT], end_m=260.0)
-    brief = replace(FEW, filter=replace(FEW.filter, horizon_m=50.0))
-    slamcu = driven(road, 3, brief, sigma_m=0.05, sigma_deg=0.05)
+    monkeypatch.setattr(track_management, "HORIZON_M", 50.0)
+    slamcu = driven(road, 3, sigma_m=0.05, sigma_deg=0.05)
     assert len(slamcu.new_features()) == 2
-    slamcu._rbpf.place(np.array([0.0, 0.0, 0.0]), np.diag([4.0, 4.0, radians(0.3) ** 2]))
+    slamcu._particles.place(np.array([0.0, 0.0, 0.0]), np.diag([4.0, 4.0, radians(0.3) ** 2]))
     rng = np.random.default_rng(5)
     for i, pose in road.poses():
         if i:
@@ -160,7 +161,7 @@ def test_given_poses_are_not_moved_by_features() -> None:
 
 
 def test_one_particle_does_where_poses_are_certain() -> None:
-    one = replace(FEW, filter=replace(FEW.filter, particles=1))
+    one = replace(FEW, particles=1)
     slamcu = driven(Road(standing=[LEFT, RIGHT], mapped=[LEFT]), 0, one, given=True)
     assert slamcu.known_states()[0].feature_class == NORMAL
     (new,) = slamcu.new_features()

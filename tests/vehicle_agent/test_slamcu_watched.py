@@ -9,9 +9,10 @@ import pytest
 from sign_road import FEW, PERIOD_S, Road
 from sign_road import NO_SHIFT as HERE
 
+from gnd.vehicle_agent.features.slamcu import noise
 from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, BlindFilter
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.features.slamcu.watch import Alarm, Watch
 from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from gnd.vehicle_agent.features.view import CAMERA
@@ -46,14 +47,14 @@ class Told:
 def watched(road: Road, trouble: Trouble, seed: int = 0, parameters: SlamcuParameters = FEW) -> Told:
     """A drive along the road whose fixes come every second, with the errors that the parameters know of."""
     rng, slow_m = np.random.default_rng([seed, 78]), sqrt(0.7) * SIGMA_M
-    error, fade = slow_m * rng.standard_normal(2), exp(-1.0 / parameters.gnss.correlation_s)
+    error, fade = slow_m * rng.standard_normal(2), exp(-1.0 / noise.GNSS_CORRELATION_S)
     slamcu = WatchedSlamcu(parameters, road.known(), np.zeros(3), np.diag([0.25, 0.25, radians(0.3) ** 2]), seed)
     true = []
     for i, pose in road.poses():
         if i:
             slamcu.predict(PERIOD_S, road.speed_mps * trouble.wheel, 0.0)
         if i == round(trouble.kidnapped_s / PERIOD_S):
-            slamcu._now.slamcu._rbpf.state[:2] += np.array(trouble.kidnapped_m)[:, None]
+            slamcu._run.slamcu._particles.state[:2] += np.array(trouble.kidnapped_m)[:, None]
         slamcu.look(road.look(i, pose, rng), CAMERA)
         true.append(pose[:2])
         if i % 15 == 0:
@@ -107,7 +108,7 @@ def test_a_map_whose_signs_all_stand_elsewhere_is_not_followed_silently() -> Non
     t_s = np.array([one.t_s for one in told.slamcu.path])
     given_up = np.zeros(len(t_s), bool)
     for one in told.slamcu.lost:
-        given_up |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.told_anew)
+        given_up |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.replayed)
     assert not (far & ~given_up).any()
     assert told.slamcu.doubts or told.slamcu.lost
 
@@ -116,7 +117,7 @@ def given_up(told: Told) -> np.ndarray:
     """(S,) looks of stretches of which the vehicle says nothing."""
     t_s, lost = np.array([one.t_s for one in told.slamcu.path]), np.zeros(len(told.slamcu.path), bool)
     for one in told.slamcu.lost:
-        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.told_anew)
+        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.replayed)
     return lost
 
 
@@ -132,7 +133,7 @@ def test_fixes_that_go_wrong_for_good_end_in_giving_up_and_nothing_concluded_the
     told = watched(road, Trouble(gnss_m=lambda t_s: np.array([0.0, 14.0]) if t_s > 40.0 else HERE), 0)
     assert told.slamcu.is_lost
     assert np.sqrt(told.slamcu.pose()[1][1, 1]) > 8.0
-    assert any(not one.told_anew for one in told.slamcu.lost)
+    assert any(not one.replayed for one in told.slamcu.lost)
     assert classes(told.slamcu) == [NORMAL] * len(SIGNS)
     assert told.slamcu.new_features() == ()
     wrong = (np.hypot(*told.off_m.T) > 5.0) & ~given_up(told)
@@ -171,7 +172,7 @@ def test_a_stretch_that_is_given_up_is_forgotten() -> None:
     assert wrong >= 5
     slamcu._give_up(Alarm("blind", 99.0, 21.1))
     (lost,) = slamcu.lost
-    assert not lost.told_anew
+    assert not lost.replayed
     assert lost.from_s < 41.0 < lost.until_s
     assert lost.taken_back >= 5
     assert classes(slamcu) == [NORMAL] * len(SIGNS)
@@ -181,7 +182,7 @@ def test_a_stretch_that_is_given_up_is_forgotten() -> None:
 
 
 def test_a_fork_goes_its_own_way() -> None:
-    slamcu = watched(replace(LONG, end_m=400.0), Trouble()).slamcu._now.slamcu
+    slamcu = watched(replace(LONG, end_m=400.0), Trouble()).slamcu._run.slamcu
     before = slamcu.pose()[0], classes_of(slamcu)
     other = slamcu.fork(9)
     other.look_anew()
@@ -200,15 +201,14 @@ def classes_of(slamcu: object) -> list[object]:
 
 def blind_run(seed: int, bias_m: float = 0.0) -> tuple[np.ndarray, np.ndarray, float]:
     """Error (3,) and covariance of a blind filter after 80 s on a curve, and the largest offset its watch has seen."""
-    parameters = SlamcuParameters()
-    rng, motion, gnss = np.random.default_rng([seed, 3]), parameters.motion, parameters.gnss
-    slow_m, white_m = sqrt(1.0 - gnss.white_share) * SIGMA_M, sqrt(gnss.white_share) * SIGMA_M
+    rng = np.random.default_rng([seed, 3])
+    slow_m, white_m = sqrt(1.0 - noise.GNSS_WHITE_SHARE) * SIGMA_M, sqrt(noise.GNSS_WHITE_SHARE) * SIGMA_M
     cov0 = np.diag([0.25, 0.25, radians(1.0) ** 2])
     true, dt_s = np.zeros(3), 0.1
     start = true + np.sqrt(np.diag(cov0)) * rng.standard_normal(3)
-    blind, watch = BlindFilter(parameters, BlindBelief.first(start, cov0, parameters)), Watch(gnss)
-    scale, bias = motion.scale * rng.standard_normal(), motion.bias_radps * rng.standard_normal()
-    error, fade, most = slow_m * rng.standard_normal(2), exp(-1.0 / gnss.correlation_s), 0.0
+    blind, watch = BlindFilter(BlindBelief.first(start, cov0)), Watch()
+    scale, bias = noise.SCALE * rng.standard_normal(), noise.BIAS_RADPS * rng.standard_normal()
+    error, fade, most = slow_m * rng.standard_normal(2), exp(-1.0 / noise.GNSS_CORRELATION_S), 0.0
     for i in range(801):
         if i % 10 == 0:
             fix = true[:2] + error + white_m * rng.standard_normal(2)
@@ -217,8 +217,8 @@ def blind_run(seed: int, bias_m: float = 0.0) -> tuple[np.ndarray, np.ndarray, f
             watch.fix(fix - true[:2] + bias_m, SIGMA_M, 1.0, exact, blind.belief)
             most = max(most, watch._offset)
             error = fade * error + sqrt(1.0 - fade**2) * slow_m * rng.standard_normal(2)
-        way = 25.0 * dt_s + motion.speed_m * sqrt(dt_s) * rng.standard_normal()
-        turn = 0.01 * dt_s + motion.yaw_rad * sqrt(dt_s) * rng.standard_normal()
+        way = 25.0 * dt_s + noise.SPEED_M * sqrt(dt_s) * rng.standard_normal()
+        turn = 0.01 * dt_s + noise.YAW_RAD * sqrt(dt_s) * rng.standard_normal()
         middle = true[2] + 0.5 * turn
         true += np.array([way * np.cos(middle), way * np.sin(middle), turn])
         blind.predict(dt_s, 25.0 / (1.0 + scale), 0.01 + bias)

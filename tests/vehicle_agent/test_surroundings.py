@@ -30,7 +30,7 @@ from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.link.download import TileFetcher
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.surroundings import LEAD_S, Surroundings, left_behind, tile_distance_m, tiles_along
+from gnd.vehicle_agent.surroundings import AHEAD_S, LEAD_S, Surroundings, left_behind, tile_distance_m, tiles_along
 
 NEVER = threading.Event()
 PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=100.0, wait_s=10.0)
@@ -93,8 +93,8 @@ def test_a_fast_vehicle_looks_farther_and_one_in_reverse_gear_back(scene: Scene)
         east_m = [FRAME.enu_from_geodetic(*t.centre_rad, 0.0)[..., 0].item() for t in scene.surroundings.wanted]
         ahead[speed_mps] = (min(east_m), max(east_m))
     assert ahead[0.0][1] == pytest.approx(PARAMETERS.ahead_m + PARAMETERS.near_m, abs=40.0)
-    assert ahead[30.0][1] == pytest.approx(30.0 * PARAMETERS.ahead_s + PARAMETERS.near_m, abs=40.0)
-    assert ahead[-30.0][0] == pytest.approx(-30.0 * PARAMETERS.ahead_s - PARAMETERS.near_m, abs=40.0)
+    assert ahead[30.0][1] == pytest.approx(30.0 * AHEAD_S + PARAMETERS.near_m, abs=40.0)
+    assert ahead[-30.0][0] == pytest.approx(-30.0 * AHEAD_S - PARAMETERS.near_m, abs=40.0)
 
 
 def test_what_is_ahead_is_asked_for_together(scene: Scene) -> None:
@@ -105,7 +105,7 @@ def test_what_is_ahead_is_asked_for_together(scene: Scene) -> None:
         scene.surroundings.follow(place, NEVER, wait=True)
     ledger = scene.ledger.totals()
     (asked,) = [line.messages for line in ledger if (line.kind, line.direction) == ("tile", "up")]
-    assert asked <= 2 + 120.0 / (10.0 * (PARAMETERS.ahead_s - LEAD_S)) * 2  # twice that: two districts
+    assert asked <= 2 + 120.0 / (10.0 * (AHEAD_S - LEAD_S)) * 2  # twice that: two districts
 
 
 @pytest.mark.parametrize(("rate_bit_s", "all_of_them"), [(1e6, True), (3e4, False)])

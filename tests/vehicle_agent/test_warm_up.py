@@ -15,8 +15,8 @@ PROGRAM = textwrap.dedent(
     from gnd.vehicle_agent.warm import warm_up
     from gnd.vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
     from gnd.vehicle_agent.features.poles import kernels as poles, place_kernels as places
-    from gnd.gnd_map.codec import kernels as coders
-    USED = ("code_bit", "code_bits", "code_flags", "code_plain", "code_voxels")
+    from gnd.gnd_map.codec import kernels as coders, voxel_kernels
+    USED = (coders.code_bit, coders.code_bits, coders.code_flags, coders.code_plain, voxel_kernels.code_voxels)
     before = len(kernel.cast_rays.signatures)
     warm_up()
     first = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
@@ -28,7 +28,7 @@ PROGRAM = textwrap.dedent(
         if hasattr(v, "signatures") and not k.startswith("_") and len(v.signatures) != 1
     ]
     print(json.dumps({
-        "cold": cold, "coders": [k for k in USED if len(getattr(coders, k).signatures) != 1],
+        "cold": cold, "coders": [k.__name__ for k in USED if len(k.signatures) != 1],
         "before": before, "after": first["cast_rays"], "same": first == again, "threads": threading.active_count(),
         "modules": sorted({m.split(".")[0] for m in sys.modules} & {"sklearn", "matplotlib", "pandas", "rich"}),
         "stats": "scipy.stats" in sys.modules,

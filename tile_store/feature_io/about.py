@@ -19,6 +19,7 @@ def about_options(options: ImportOptions) -> dict[str, Any]:
         "sigma_m": options.sigma_m,
         "sigma_up_m": options.sigma_up_m,
         "exist": options.exist,
+        "strict": options.strict,
     }
 
 

@@ -6,7 +6,7 @@ convert_city_coords_to_wgs84). Nothing is said there of the datum of z: heights 
 ellipsoid is given.
 
 Format of the file: av2-api, src/av2/map/map_api.py and lane_segment.py. Two lanes beside each other name their common
-border both; it becomes one feature that names both lanes.
+border both; it becomes one feature that names both lanes. Lanes with their successors are kept beside the features.
 """
 
 import re
@@ -22,14 +22,15 @@ from gnd.gnd_map.utm import geodetic_from_utm, utm_from_geodetic
 from gnd.tile_store.feature_io.errors import BadElement, BadGeometry, DuplicateId, NeedsGeoreference
 from gnd.tile_store.feature_io.json_file import as_text, member, read_json, real_number
 from gnd.tile_store.feature_io.lane_crossing import crossing_of
+from gnd.tile_store.feature_io.lane_network import Border, MapLane
 from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
+    Findings,
     ImportOptions,
     MapFeature,
     attributes_of,
-    check_simple,
 )
 
 FORMAT: Final = "argoverse2"
@@ -85,6 +86,13 @@ class _LaneLine:
     attributes: dict[str, str]
     lanes: list[str] = field(default_factory=list)
 
+    def also(self, attributes: dict[str, str]) -> None:
+        """What another lane says of it; where it says otherwise, both are kept."""
+        for name, value in attributes.items():
+            words = sorted({*self.attributes.get(name, value).split(), *value.split()} - {""})
+            marked = [word for word in words if word != "NONE"] if name == "mark" else words
+            self.attributes[name] = " ".join(marked or words)
+
 
 def read_argoverse(
     data: bytes,
@@ -109,18 +117,21 @@ def read_argoverse(
     """
     place = city_of(where, city)
     told = read_json(data, where)
-    lines = [*_lane_lines(told, where, progress), *_crosswalks(told, where), *_areas(told, where)]
+    findings = Findings(options.strict)
+    borders = _lane_lines(told, where, findings, progress)
+    lines = [*borders.lines.values(), *_crosswalks(told, where), *_areas(told, where)]
     left_out: Counter[str] = Counter()
-    features = []
+    features: list[MapFeature] = []
     for line in lines:
         layer = options.layer_of(line.kind)
         if layer == LEFT_OUT:
             left_out[line.kind] += 1
             continue
         feature = _feature(line, layer, where, source, options, place)
-        check_simple(feature)
+        findings.check_simple(feature)
         features.append(feature)
-    return FeatureFile(FORMAT, tuple(features), dict(sorted(left_out.items())))
+    lanes = _lanes(told, where, source, borders) if options.layer_of("lane_boundary") != LEFT_OUT else ()
+    return FeatureFile(FORMAT, tuple(features), dict(sorted(left_out.items())), notes=findings.told(), lanes=lanes)
 
 
 def _feature(line: _LaneLine, layer: str, where: str, source: str, options: ImportOptions, city: City) -> MapFeature:
@@ -133,26 +144,66 @@ def _feature(line: _LaneLine, layer: str, where: str, source: str, options: Impo
     )  # fmt: skip
 
 
-def _lane_lines(told: Any, where: str, progress: Progress | None) -> list[_LaneLine]:
-    """The borders of all lanes, each once."""
+@dataclass(slots=True)
+class _Borders:
+    """The borders of all lanes, each once however many lanes name it, in either direction.
+
+    Attributes:
+        lines: by their vertices.
+        of_lane: of each side of a lane, "1:left", its line and whether its vertices are in the lane's direction.
+    """
+
+    lines: dict[bytes, _LaneLine] = field(default_factory=dict)
+    of_lane: dict[str, tuple[_LaneLine, bool]] = field(default_factory=dict)
+
+    def put(self, line: _LaneLine, side: str) -> None:
+        ahead, back = line.points_m.tobytes(), line.points_m[::-1].tobytes()
+        first = self.lines.setdefault(min(ahead, back), line)
+        same = first.points_m.tobytes() == ahead
+        first.lanes.append(side)
+        first.also(line.attributes if same else line.attributes | {"mark": _mirrored(line.attributes["mark"])})
+        self.of_lane[side] = (first, same)
+
+
+def _mirrored(mark: str) -> str:
+    """A mark seen in the other direction."""
+    swapped = {"DASH_SOLID": "SOLID_DASH", "SOLID_DASH": "DASH_SOLID"}
+    return next((other + mark.removeprefix(name) for name, other in swapped.items() if mark.startswith(name)), mark)
+
+
+def _lane_lines(told: Any, where: str, findings: Findings, progress: Progress | None) -> _Borders:
     segments = member(where, told, "lane_segments", dict)
-    lines: dict[bytes, _LaneLine] = {}
+    borders = _Borders()
     for number, (key, lane) in enumerate(segments.items()):
         lane_id = _id(where, "lane segment", key, lane)
         sides = {side: _points(lane_id, lane, f"{side}_lane_boundary") for side in ("left", "right")}
-        _check_crossing(lane_id, sides["left"], sides["right"])
+        _check_crossing(lane_id, sides["left"], sides["right"], findings)
         for side, points_m in sides.items():
-            _put(lines, _border(lane_id, lane, key, side, points_m), f"{key}:{side}")
+            borders.put(_border(lane_id, lane, key, side, points_m), f"{key}:{side}")
         if progress and number % _EVERY == 0:
             progress("reading lanes", number, len(segments))
-    return list(lines.values())
+    return borders
 
 
-def _put(lines: dict[bytes, _LaneLine], line: _LaneLine, lane: str) -> None:
-    """One border however many lanes name it, in either direction, as long as they say the same of it."""
-    said = repr(sorted(line.attributes.items())).encode()
-    there = min(line.points_m.tobytes(), line.points_m[::-1].tobytes()) + said
-    lines.setdefault(there, line).lanes.append(lane)
+_SUBTYPES: Final = {"VEHICLE": "road", "BUS": "bus_lane", "BIKE": "bicycle_lane"}
+
+
+def _lanes(told: Any, where: str, source: str, borders: _Borders) -> tuple[MapLane, ...]:
+    """The lane segments with those successors that the file holds; logs cut their maps out of a city's."""
+    segments = told["lane_segments"]
+    lanes = []
+    for key, lane in segments.items():
+        name = f"{where}, lane segment {key}"
+        sides = []
+        for side in ("left", "right"):
+            line, ahead = borders.of_lane[f"{key}:{side}"]
+            sides.append(Border(feature_id_of(FORMAT, source, *line.key), ahead))
+        successors = tuple(str(one) for one in member(name, lane, "successors", list) if str(one) in segments)
+        subtype = _SUBTYPES.get(as_text(lane.get("lane_type", "")), "road")
+        place = {"location": "urban", "one_way": "yes", "source_lane": key, "subtype": subtype}
+        turn = {"intersection": "yes"} if lane.get("is_intersection") else {}
+        lanes.append(MapLane(key, sides[0], sides[1], successors, tuple(sorted((place | turn).items()))))
+    return tuple(lanes)
 
 
 def _border(where: str, lane: dict[str, Any], key: str, side: str, points_m: F64) -> _LaneLine:
@@ -163,11 +214,11 @@ def _border(where: str, lane: dict[str, Any], key: str, side: str, points_m: F64
     return _LaneLine("lane_boundary", ("lane", key, side), points_m, attributes)
 
 
-def _check_crossing(where: str, left_m: F64, right_m: F64) -> None:
+def _check_crossing(where: str, left_m: F64, right_m: F64, findings: Findings) -> None:
     met = crossing_of(left_m[:, :2], right_m[:, :2])
     if met is not None:
         x, y = left_m[met[0], :2]
-        raise BadGeometry(
+        findings.add(
             f"{where}: its borders cross each other, segment {met[0] + 1} of {len(left_m) - 1} on the left and "
             f"{met[1] + 1} of {len(right_m) - 1} on the right, near ({x:.1f}, {y:.1f}) m"
         )

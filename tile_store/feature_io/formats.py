@@ -1,7 +1,7 @@
 """Files of features by their names: which format, and how it is read and written."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -12,9 +12,11 @@ from gnd.tile_store.feature_io.errors import FeatureFileError, UnknownFormat
 from gnd.tile_store.feature_io.geojson_export import write_geojson
 from gnd.tile_store.feature_io.geojson_import import read_geojson
 from gnd.tile_store.feature_io.json_file import MAX_JSON_BYTES
+from gnd.tile_store.feature_io.lane_network import MapLane
 from gnd.tile_store.feature_io.lanelet2_export import EMPTY, Changes, write_lanelet2
-from gnd.tile_store.feature_io.lanelet2_import import FORMAT as LANELET2
 from gnd.tile_store.feature_io.lanelet2_import import read_lanelet2
+from gnd.tile_store.feature_io.opendrive_export import write_opendrive
+from gnd.tile_store.feature_io.opendrive_import import FORMAT as OPENDRIVE
 from gnd.tile_store.feature_io.opendrive_import import read_opendrive
 from gnd.tile_store.feature_io.osm_document import MAX_FILE_BYTES, Progress
 from gnd.tile_store.feature_io.sources import FeatureSource
@@ -26,7 +28,7 @@ from gnd.tile_store.sqlite_store import SqliteStore
 
 Format = Literal["lanelet2", "opendrive", "geojson", "argoverse2"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
-WRITTEN: Final[tuple[Format, ...]] = ("lanelet2", "geojson")
+WRITTEN: Final[tuple[Format, ...]] = ("lanelet2", "opendrive", "geojson")
 _OF_SUFFIX: Final[dict[str, Format]] = {".osm": "lanelet2", ".xodr": "opendrive", ".geojson": "geojson"}
 _READERS: Final[dict[Format, Callable[..., FeatureFile]]] = {
     "lanelet2": read_lanelet2,
@@ -99,9 +101,9 @@ def export_features(
 ) -> FeaturesExported:
     """Write the newest features of a store to a file, which appears whole or not at all.
 
-    As Lanelet2 they are written into the file that they came from, when the store has one (`source` says which of
-    several; "" means a new file); then layers and region must not be chosen, because what is not chosen would count as
-    gone.
+    As Lanelet2 or OpenDRIVE they are written into the file that they came from, when the store has one (`source` says
+    which of several; "" means a new file, which OpenDRIVE has none of); then layers and region must not be chosen,
+    because what is not chosen would count as gone.
 
     Raises:
         FeatureFileError: no features, a format that is not written, sources that leave no or several choices.
@@ -110,28 +112,48 @@ def export_features(
     if found not in WRITTEN:
         raise UnknownFormat(f"{path}: {found} is read only; written are {', '.join(WRITTEN)}")
     features = load_features(store, layers, region)
-    kept = _source(store, source, chosen=bool(layers or region)) if found == LANELET2 else None
+    kept = None if found == "geojson" else _source(store, found, source, chosen=bool(layers or region))
+    if found == OPENDRIVE and kept is None:
+        raise FeatureFileError(
+            f"{store.path}: OpenDRIVE is written into the file that the features came from, and no source is one, or a "
+            "part was chosen; write .osm (Lanelet2) or .geojson"
+        )
     if not features and kept is None:
         raise FeatureFileError(
             f"{store.path}: no features in {', '.join(layers) or 'any layer'}, {region or 'everywhere'}"
         )
     if found == "geojson":
         body, changes, told = write_geojson(features), None, len(features)
+    elif found == OPENDRIVE and kept is not None:
+        mine = _without_foreign(store, features, kept)
+        body, changes = write_opendrive(mine, kept.document, kept.name, options_about(kept.options))
+        told = len(mine)
     else:
         body, changes, told = _lanelet2(store, features, kept)
     write_whole(path, body)
     return FeaturesExported(str(path), found, told, len(body), kept.name if kept else None, changes)
 
 
-def _source(store: SqliteStore, said: str | None, *, chosen: bool) -> FeatureSource | None:
-    known = {name: one for name, one in sources_of(store).items() if one.format == LANELET2}
+def _all_lanes(store: SqliteStore) -> list[MapLane]:
+    """The lanes of all sources; their keys are made different, because two files may use one."""
+    found = []
+    for name, source in sources_of(store).items():
+        known = {lane.key for lane in source.lanes}
+        for lane in source.lanes:
+            following = tuple(f"{name} {key}" for key in lane.successors if key in known)
+            found.append(replace(lane, key=f"{name} {lane.key}", successors=following))
+    return found
+
+
+def _source(store: SqliteStore, format_: str, said: str | None, *, chosen: bool) -> FeatureSource | None:
+    known = {name: one for name, one in sources_of(store).items() if one.format == format_}
     if said == "" or (said is None and (not known or chosen)):
         return None
     if said is None and len(known) > 1:
         raise FeatureFileError(f"{store.path}: features come from {', '.join(known)}; say which with --source")
     name = said if said is not None else next(iter(known))
     if name not in known:
-        raise FeatureFileError(f"{store.path}: no Lanelet2 file {name!r:.80}; it has {', '.join(known) or 'none'}")
+        raise FeatureFileError(f"{store.path}: no {format_} file {name!r:.80}; it has {', '.join(known) or 'none'}")
     if chosen:
         raise FeatureFileError(
             f"{name}: with --source all layers and regions are written; choose a new file: --source ''"
@@ -144,9 +166,15 @@ def _lanelet2(
 ) -> tuple[bytes, Changes | None, int]:
     """The file with its own features and new ones; those of other files stay out."""
     if kept is None:
-        return write_lanelet2(features, EMPTY)[0], None, len(features)
-    others = (one for name, one in sources_of(store).items() if name != kept.name)
-    foreign = {id_ for other in others for ids in other.ids.values() for id_ in ids}
-    mine = [feature for feature in features if feature.feature_id not in foreign]
+        body, changes = write_lanelet2(features, EMPTY, lanes=_all_lanes(store))
+        return body, changes, len(features)
+    mine = _without_foreign(store, features, kept)
     body, changes = write_lanelet2(mine, kept.document, kept.name, options_about(kept.options))
     return body, changes, len(mine)
+
+
+def _without_foreign(store: SqliteStore, features: list[MapFeature], kept: FeatureSource) -> list[MapFeature]:
+    """The features that are a source's own or no source's."""
+    others = (one for name, one in sources_of(store).items() if name != kept.name)
+    foreign = {id_ for other in others for ids in other.ids.values() for id_ in ids}
+    return [feature for feature in features if feature.feature_id not in foreign]

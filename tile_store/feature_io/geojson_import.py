@@ -23,10 +23,10 @@ from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
+    Findings,
     ImportOptions,
     MapFeature,
     attributes_of,
-    check_simple,
 )
 
 FORMAT: Final = "geojson"
@@ -66,16 +66,17 @@ def read_geojson(
     reading = _GeojsonReading(where, source, options, ours)
     left_out: Counter[str] = Counter()
     features: list[MapFeature] = []
+    findings = Findings(options.strict)
     for number, item in enumerate(items):
         for feature in _features(reading, item, number):
             if feature.layer == LEFT_OUT:
                 left_out[feature.kind] += 1
             else:
-                check_simple(feature)
+                findings.check_simple(feature)
                 features.append(feature)
         if progress and number % _EVERY == 0:
             progress("reading", number, len(items))
-    return FeatureFile(FORMAT, tuple(features), dict(sorted(left_out.items())))
+    return FeatureFile(FORMAT, tuple(features), dict(sorted(left_out.items())), notes=findings.told())
 
 
 def _items(told: Any, where: str) -> tuple[list[Any], bool]:

@@ -13,20 +13,25 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import meridian_radius_m, normal_radius_m
-from gnd.tile_store.feature_io.lanelet2_import import DrawnLane, NodePlaces, drawn_features, places_of
-from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, read_osm
+from gnd.tile_store.feature_io.errors import FeatureFileError
+from gnd.tile_store.feature_io.lane_network import MapLane
+from gnd.tile_store.feature_io.lanelet2_import import DrawnLane, drawn_features
+from gnd.tile_store.feature_io.lanelet2_lanes import JoinedEnds, joined_ends, line_tags
+from gnd.tile_store.feature_io.lanelet2_places import NodePlaces, places_of
+from gnd.tile_store.feature_io.osm_document import MAX_ID, OsmDocument, OsmNode, OsmWay, read_osm
 from gnd.tile_store.feature_io.osm_edit import (
     Edits,
     degrees,
     line_of,
     metres,
     node_lines,
+    relation_lines,
     way_lines,
     with_nodes,
     with_values,
     without_members,
 )
-from gnd.tile_store.feature_io.osm_kinds import POINT_KINDS
+from gnd.tile_store.feature_io.osm_kinds import POINT_KINDS, kind_of
 from gnd.tile_store.feature_io.values import ImportOptions, MapFeature
 
 EMPTY: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
@@ -39,12 +44,29 @@ KEEP_WITHIN_M: Final = 0.002
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What an export changed in the file: elements."""
+    """What an export changed in the file.
+
+    Attributes:
+        moved: elements that lie elsewhere.
+        retagged: elements with other attributes or tags.
+        removed: elements that are gone.
+        added: features that are new.
+        lanelets: added with the lines between which they run.
+        joined_m: the farthest that an end of a border was moved to meet the next one.
+        apart: successors of lanes whose borders end too far from each other to be joined.
+        unbounded: lanes that were left out because a border of theirs is not among the features.
+        unwritten: features that have changed in a way that the format cannot say, so that they are as they were.
+    """
 
     moved: int
     retagged: int
     removed: int
     added: int
+    lanelets: int = 0
+    joined_m: float = 0.0
+    apart: int = 0
+    unbounded: int = 0
+    unwritten: int = 0
 
 
 def write_lanelet2(
@@ -54,6 +76,7 @@ def write_lanelet2(
     options: ImportOptions | None = None,
     *,
     keep_within_m: float = KEEP_WITHIN_M,
+    lanes: Iterable[MapLane] = (),
 ) -> tuple[bytes, Changes]:
     """The file with the features as they are now, and what that changed.
 
@@ -63,6 +86,7 @@ def write_lanelet2(
         source: under which name it was imported.
         options: how it was read.
         keep_within_m: vertices that have moved less keep the bytes of their position; negative: all are written anew.
+        lanes: to be added as lanelets, between borders that are new to the document.
 
     Raises:
         FeatureFileError: the document cannot be read.
@@ -77,8 +101,8 @@ def write_lanelet2(
             editing.update(one, now[feature_id])
         else:
             editing.remove(one)
-    for feature_id in sorted(now.keys() - drawn.keys()):
-        editing.add(now[feature_id])
+    new = {feature_id: now[feature_id] for feature_id in sorted(now.keys() - drawn.keys())}
+    editing.add(new, lanes)
     return editing.finish()
 
 
@@ -93,6 +117,9 @@ class _Editing:
         self._gone: set[tuple[str, int]] = set()
         self._new_nodes: list[bytes] = []
         self._new_ways: list[bytes] = []
+        self._new_relations: list[bytes] = []
+        self._apart = self._unbounded = 0
+        self._joined_m = 0.0
         self._next_id = document.highest_id + 1
         self._added = 0
         self._in_ways = {ref for way in document.ways.values() for ref in way.nodes}
@@ -116,14 +143,14 @@ class _Editing:
 
     def _move(self, nodes: tuple[OsmNode, ...], new: F64, old: F64) -> None:
         for node, place, was in zip(nodes, new, old, strict=True):
-            if _apart_m(place, was) > self._keep_within_m:
+            if apart_m(place, was) > self._keep_within_m:
                 self._moved[node.id].append(place)
 
     def _redraw(self, way: OsmWay, new: F64, old: F64) -> None:
         """A line with other vertices: nodes that are where one was are kept, the others are new."""
         refs = []
         for place in new:
-            apart = [_apart_m(place, was) for was in old]
+            apart = [apart_m(place, was) for was in old]
             nearest = int(np.argmin(apart))
             refs.append(way.nodes[nearest] if apart[nearest] <= KEEP_WITHIN_M else self._node(place, {}))
         self._refs[way.id] = refs
@@ -136,19 +163,40 @@ class _Editing:
         else:
             self._gone.add(key)
 
-    def add(self, feature: MapFeature) -> None:
-        """A feature that the file has not."""
-        tags = {"type": feature.kind} | dict(feature.attributes)
+    def add(self, features: Mapping[int, MapFeature], lanes: Iterable[MapLane]) -> None:
+        """Features that the file has not, by id, and lanelets between them."""
+        lanes = list(lanes)
+        bounded = [
+            lane for lane in lanes if {lane.left.feature_id, lane.right.feature_id} <= features.keys()
+        ]  # the others have lost a border
+        ends = joined_ends(bounded, {feature_id: _line(one) for feature_id, one in features.items()})
+        shared = {number: self._node(place, {}) for number, place in ends.place.items()}
+        ways = {one: self._add(feature, ends, shared) for one, feature in features.items()}
+        for lane in bounded:
+            members = (("way", ways[lane.left.feature_id], "left"), ("way", ways[lane.right.feature_id], "right"))
+            tags = {"type": "lanelet"} | dict(lane.tags)
+            self._new_relations.append(relation_lines(self._new_id(), members, tags))
+        self._apart, self._unbounded, self._joined_m = len(ends.apart), len(lanes) - len(bounded), ends.moved_m
+
+    def _add(self, feature: MapFeature, ends: JoinedEnds, shared: Mapping[int, int]) -> int:
+        """The id of the new element; ends of borders that meet are one node."""
         self._added += 1
         if len(feature) == 1:
-            self._node(_line(feature)[0], tags)
-        else:
-            refs = [self._node(place, {}) for place in _line(feature)]
-            tags = {"type": "line_thin"} | dict(feature.attributes) if feature.kind == "lane_boundary" else tags
-            self._new_ways.append(way_lines(self._new_id(), refs, tags))
+            return self._node(_line(feature)[0], _tags_of(feature))
+        line, last = _line(feature), len(feature) - 1
+        group = {0: ends.group.get((feature.feature_id, 0)), last: ends.group.get((feature.feature_id, -1))}
+        refs = []
+        for row, place in enumerate(line):
+            number = group.get(row)
+            refs.append(self._node(place, {}) if number is None else shared[number])
+        way_id = self._new_id()
+        self._new_ways.append(way_lines(way_id, refs, _tags_of(feature)))
+        return way_id
 
     def _new_id(self) -> int:
         self._next_id += 1
+        if self._next_id > MAX_ID:
+            raise FeatureFileError(f"{self._document.where}: its ids leave none for new elements below 2^63")
         return self._next_id - 1
 
     def _node(self, place: F64, tags: Mapping[str, str]) -> int:
@@ -178,10 +226,14 @@ class _Editing:
             edits.replace(element.start, element.end, self._rewritten(data, element, attributes, tags))
         if self._new_nodes:
             edits.replace(self._document.end_of_nodes, self._document.end_of_nodes, b"".join(self._new_nodes))
-        if self._new_ways:
-            edits.replace(self._document.end_of_ways, self._document.end_of_ways, b"".join(self._new_ways))
+        for new in (self._new_ways, self._new_relations):
+            if new:
+                edits.replace(self._document.end_of_ways, self._document.end_of_ways, b"".join(new))
         moved = len(self._moved) + len(self._refs)
-        return edits.applied(data), Changes(moved, len(self._tags), removed, self._added)
+        return edits.applied(data), Changes(
+            moved, len(self._tags), removed, self._added,
+            len(self._new_relations), round(self._joined_m, 4), self._apart, self._unbounded,
+        )  # fmt: skip
 
     def _values(self) -> dict[tuple[str, int], tuple[dict[str, str], dict[str, str | None]]]:
         """Attributes and tags to write, by element."""
@@ -262,7 +314,7 @@ def _global(node: OsmNode, lat: float, lon: float, height_m: float) -> tuple[dic
 def _local(node: OsmNode, local_m: F64, was_m: F64) -> tuple[dict[str, str], dict[str, str | None]]:
     lat_deg, lon_deg = _shifted(node, local_m - was_m)
     tags: dict[str, str | None] = {"local_x": metres(local_m[0]), "local_y": metres(local_m[1])}
-    return {"lat": degrees(lat_deg), "lon": degrees(lon_deg)}, tags | (
+    return {k: degrees(v) for k, v in (("lat", lat_deg), ("lon", lon_deg)) if not np.isnan(v)}, tags | (
         {"ele": metres(local_m[2])} if "ele" in node.tags else {}
     )
 
@@ -271,20 +323,31 @@ def _name(element: OsmNode | OsmWay) -> str:
     return "way" if isinstance(element, OsmWay) else "node"
 
 
+def _tags_of(feature: MapFeature) -> dict[str, str]:
+    """Tags of a new element: what it is, read back as the same kind; what they would hide keeps another name."""
+    told = dict(feature.attributes)
+    if feature.kind == "lane_boundary":
+        return line_tags(told)
+    if kind_of(told) == feature.kind:
+        return told
+    hidden = {f"source_{key}": told.pop(key) for key in ("type", "subtype") if key in told}
+    return {"type": feature.kind} | told | hidden
+
+
 def _line(feature: MapFeature) -> F64:
     """(N, 3) latitude, longitude, height."""
     return np.column_stack([feature.lat_rad, feature.lon_rad, feature.height_m])
 
 
-def _apart_m(a: F64, b: F64) -> float:
-    """Distance of two near positions."""
+def apart_m(a: F64, b: F64) -> float:
+    """Distance of two near positions: latitude, longitude (radians), height."""
     lat = float(a[0])
     north, east = meridian_radius_m(lat) * (a[0] - b[0]), normal_radius_m(lat) * np.cos(lat) * (a[1] - b[1])
     return float(np.sqrt(north**2 + east**2 + (a[2] - b[2]) ** 2))
 
 
 def _shifted(node: OsmNode, step_m: F64) -> tuple[float, float]:
-    """A placeholder's degrees, moved as far as its local coordinates are (x east, y north)."""
+    """A placeholder's degrees, moved as far as its local coordinates are (x east, y north); NaN stays."""
     lat = np.radians(node.lat_deg)
     north, east = step_m[1] / meridian_radius_m(lat), step_m[0] / (normal_radius_m(lat) * np.cos(lat))
     return node.lat_deg + float(np.degrees(north)), node.lon_deg + float(np.degrees(east))

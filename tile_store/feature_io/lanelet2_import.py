@@ -15,42 +15,20 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import feature_id_of
-from gnd.tile_store.feature_io.errors import BadGeometry, NeedsGeoreference
-from gnd.tile_store.feature_io.lane_crossing import crossing_of
-from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, Progress, read_osm, real
+from gnd.tile_store.feature_io.lanelet2_borders import check_lanelets, lanelet_borders, lanes_of_lanelets
+from gnd.tile_store.feature_io.lanelet2_places import NodePlaces, places_of
+from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, Progress, read_osm
 from gnd.tile_store.feature_io.osm_kinds import POINT_KINDS, kind_of, told_of
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
+    Findings,
     ImportOptions,
     MapFeature,
     attributes_of,
-    check_positions,
-    check_simple,
-    check_vertices,
 )
 
 FORMAT: Final = "lanelet2"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NodePlaces:
-    """Where the nodes of a document are.
-
-    index: by node id the row. lat_rad, lon_rad, height_m: (N,). has_height: (N,). local_m: (N, 3) when the document's
-    local coordinates were used, else None.
-    """
-
-    index: dict[int, int]
-    lat_rad: F64
-    lon_rad: F64
-    height_m: F64
-    has_height: "np.ndarray[tuple[int], np.dtype[np.bool_]]"
-    local_m: F64 | None
-
-    def rows(self, nodes: list[OsmNode]) -> list[int]:
-        """Rows of nodes."""
-        return [self.index[node.id] for node in nodes]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,33 +56,54 @@ def read_lanelet2(
         FeatureFileError: one of its family says what is wrong and where.
     """
     document = read_osm(data, where, progress=progress)
-    drawn, left_out = drawn_features(document, source, options)
+    findings = Findings(options.strict)
+    drawn, left_out = drawn_features(document, source, options, findings)
     for one in drawn:
-        check_simple(one.feature)
-    check_lanelets(document, places_of(document, options))
-    return FeatureFile(FORMAT, tuple(one.feature for one in drawn), left_out, data)
+        findings.check_simple(one.feature)
+    borders = lanelet_borders(document, places_of(document, options))
+    check_lanelets(document, borders, findings)
+    features = tuple(one.feature for one in drawn)
+    ways = {one.element.id: one.feature.feature_id for one in drawn if isinstance(one.element, OsmWay)}
+    kept = Counter(one.tags.get("type", "untyped relation") for one in document.relations.values())
+    return FeatureFile(
+        FORMAT, features, left_out, data, findings.told(), lanes_of_lanelets(borders, ways), dict(sorted(kept.items()))
+    )
 
 
 def drawn_features(
-    document: OsmDocument, source: str, options: ImportOptions
+    document: OsmDocument, source: str, options: ImportOptions, findings: Findings | None = None
 ) -> tuple[list[DrawnLane], dict[str, int]]:
-    """The features that elements of a document draw, and how many of which kinds have no layer."""
+    """The features that elements of a document draw, and how many of which kinds have no layer.
+
+    A way without two nodes draws no line: it is left out, and a finding when these are collected.
+    """
     places, borders = places_of(document, options), _borders(document)
     left_out: Counter[str] = Counter()
     found: list[tuple[str, OsmNode | OsmWay, list[OsmNode]]] = []
     for way in document.ways.values():
         kind = kind_of(way.tags, border=way.id in borders)
-        if kind is not None:
+        if kind is None:
+            left_out["untyped_way"] += 1
+        else:
             found.append((kind, way, document.nodes_of(way)))
     for node in document.nodes.values():
         kind = kind_of(node.tags)
-        if kind is not None:
+        if kind == "lane_boundary":
+            left_out["lane_boundary_node"] += 1  # a vertex that bears the type of its line
+        elif kind is not None:
             found.append((kind, node, [node]))
     drawn = []
     for kind, element, nodes in found:
         layer = options.layer_of(kind)
         if layer == LEFT_OUT:
             left_out[kind] += 1
+        elif len(nodes) < least_nodes(kind, element):
+            left_out["short_way"] += 1
+            if findings:
+                findings.add(
+                    f"{document.where}, line {element.line}: way {element.id} ({kind}) has {len(nodes)} nodes; a line "
+                    f"needs {least_nodes(kind, element)}"
+                )
         else:
             drawn.append(_drawn(document, source, options, places, kind, layer, element, nodes))
     return drawn, dict(sorted(left_out.items()))
@@ -122,14 +121,10 @@ def _drawn(
 ) -> DrawnLane:
     what = "way" if isinstance(element, OsmWay) else "node"
     name = f"{document.where}, line {element.line}: {what} {element.id}"
-    if not nodes:
-        raise BadGeometry(f"{name} ({kind}) has no nodes, so no position")
     rows = places.rows(nodes)
     line = np.column_stack([places.lat_rad[rows], places.lon_rad[rows], places.height_m[rows]])
     if kind in POINT_KINDS:
         line = middle_of(line)[None]
-    elif len(line) < 2:
-        raise BadGeometry(f"{name} ({kind}) has {len(line)} node; a line needs 2")
     feature = MapFeature(
         feature_id_of(FORMAT, source, what, element.id), kind, layer,
         line[:, 0].copy(), line[:, 1].copy(), line[:, 2].copy(),
@@ -139,105 +134,20 @@ def _drawn(
     return DrawnLane(feature, element, tuple(nodes))
 
 
+def least_nodes(kind: str, element: OsmNode | OsmWay) -> int:
+    """So many nodes draw a feature of a kind."""
+    return 1 if kind in POINT_KINDS or isinstance(element, OsmNode) else 2
+
+
 def middle_of(line: F64) -> F64:
     """(3,) the middle of what the vertices (N, 3) span: a plate drawn by its edges hangs there."""
-    return np.asarray((line.min(axis=0) + line.max(axis=0)) / 2.0)
+    turn = np.array([0.0, 2.0 * np.pi, 0.0])
+    line = line - turn * np.round((line - line[0]) / (2.0 * np.pi))  # a plate at 180 degrees does not span the Earth
+    middle = (line.min(axis=0) + line.max(axis=0)) / 2.0
+    return np.asarray(middle - turn * np.round(middle / (2.0 * np.pi)))
 
 
 def _borders(document: OsmDocument) -> set[int]:
     """Ids of the ways that are borders of lanelets."""
     lanelets = (one for one in document.relations.values() if one.tags.get("type") == "lanelet")
     return {ref for lanelet in lanelets for role in ("left", "right") for ref in lanelet.member("way", role)}
-
-
-def places_of(document: OsmDocument, options: ImportOptions) -> NodePlaces:
-    """Where the nodes are: by their local coordinates when a placement is given, by latitude and longitude otherwise.
-
-    Raises:
-        NeedsGeoreference: there are local coordinates and nothing says whether latitudes and longitudes hold; or a
-            placement is given and a node has no local coordinates.
-        BadGeometry: a position beyond the Earth.
-    """
-    nodes = list(document.nodes.values())
-    index = {node.id: row for row, node in enumerate(nodes)}
-    has_local = np.array(["local_x" in node.tags and "local_y" in node.tags for node in nodes], np.bool_)
-    has_height = np.array(["ele" in node.tags for node in nodes], np.bool_)
-    height_m = np.array([_value(document, node, "ele") for node in nodes], np.float64)
-    if options.placement is not None:
-        local_m = _local(document, nodes, has_local, height_m)
-        lat, lon, height_m = options.placement.geodetic(local_m) if nodes else (np.zeros(0),) * 3
-        has_height &= options.placement.height_known or options.height_offset_m != 0.0
-    else:
-        _refuse_placeholders(document, has_local, options)
-        local_m = None
-        lat, lon = np.radians(np.array([(n.lat_deg, n.lon_deg) for n in nodes], np.float64).reshape(-1, 2)).T
-    height_m = height_m + options.height_offset_m
-    _check_places(document, nodes, lat, lon, height_m)
-    return NodePlaces(index, lat, lon, height_m, has_height, local_m)
-
-
-def _check_places(document: OsmDocument, nodes: list[OsmNode], lat: F64, lon: F64, height_m: F64) -> None:
-    try:
-        if nodes:
-            check_positions(document.where, lat, lon, height_m)
-    except BadGeometry:
-        for row, node in enumerate(nodes):
-            told = f"{document.where}, line {node.line}: node {node.id}"
-            check_positions(told, *(column[row : row + 1] for column in (lat, lon, height_m)))
-        raise
-
-
-def _refuse_placeholders(
-    document: OsmDocument, has_local: "np.ndarray[tuple[int], np.dtype[np.bool_]]", options: ImportOptions
-) -> None:
-    if has_local.any() and not options.trust_latlon:
-        raise NeedsGeoreference(
-            f"{document.where}: {has_local.sum()} of {len(has_local)} nodes have local_x and local_y, so that their "
-            "lat and lon may be placeholders; say --georeference latlon if they hold, an anchor "
-            "(LAT,LON[,HEIGHT[,BEARING]]) or track if they do not"
-        )
-
-
-def _local(
-    document: OsmDocument,
-    nodes: list[OsmNode],
-    has_local: "np.ndarray[tuple[int], np.dtype[np.bool_]]",
-    height_m: F64,
-) -> F64:
-    if not has_local.all():
-        first = nodes[int(np.argmin(has_local))]
-        raise NeedsGeoreference(
-            f"{document.where}, line {first.line}: {(~has_local).sum()} of {len(nodes)} nodes have no local_x and "
-            f"local_y, first node {first.id}; a georeference places local coordinates only"
-        )
-    x, y = (np.array([_value(document, node, key) for node in nodes], np.float64) for key in ("local_x", "local_y"))
-    return np.column_stack([x, y, height_m])
-
-
-def _value(document: OsmDocument, node: OsmNode, key: str) -> float:
-    text = node.tags.get(key)
-    return 0.0 if text is None else real(f"{document.where}, line {node.line}", f"{key} of node {node.id}", text)
-
-
-def check_lanelets(document: OsmDocument, places: NodePlaces) -> None:
-    """BadGeometry when the borders of a lanelet cross each other."""
-    for relation in document.relations.values():
-        if relation.tags.get("type") != "lanelet":
-            continue
-        sides = []
-        for role in ("left", "right"):
-            nodes = [n for ref in relation.member("way", role) for n in document.nodes_of(document.ways[ref])]
-            check_vertices(
-                f"{document.where}, line {relation.line}: {role} border of lanelet {relation.id}", len(nodes)
-            )
-            rows = places.rows(nodes)
-            sides.append(
-                np.column_stack([places.lon_rad[rows] * np.cos(places.lat_rad[rows[:1]]), places.lat_rad[rows]])
-            )
-        met = crossing_of(sides[0], sides[1])
-        if met is not None:
-            raise BadGeometry(
-                f"{document.where}, line {relation.line}: the borders of lanelet {relation.id} cross each other "
-                f"(segment {met[0] + 1} of {len(sides[0]) - 1} on the left, {met[1] + 1} of {len(sides[1]) - 1} on the "
-                "right)"
-            )

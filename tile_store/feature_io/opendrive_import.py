@@ -1,59 +1,45 @@
-"""OpenDRIVE maps as features: signals, objects, and the borders of lanes.
+"""OpenDRIVE maps as features: signals, objects, and the borders of lanes; the lanes with their successors beside them.
 
 Format: ASAM OpenDRIVE 1.4 to 1.8. Curves are sampled every half metre and thinned to 5 mm. The header's geoReference is
 any that pyproj understands (an optional library: extra `opendrive`); files without one need an anchor.
 """
 
-import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from functools import partial
+from typing import Final
 
 import numpy as np
 
-from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import feature_id_of
-from gnd.gnd_map.features.feature import KIND_PATTERN
 from gnd.tile_store.feature_io.errors import (
     BadElement,
     DuplicateId,
     FileTooLarge,
-    MissingLibrary,
-    NeedsGeoreference,
     UnknownFormat,
 )
+from gnd.tile_store.feature_io.lane_network import MapLane
 from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
+    Findings,
     ImportOptions,
     MapFeature,
     attributes_of,
-    check_simple,
 )
 from gnd.tile_store.feature_io.xml_spans import Element, read_root
 from gnd.tile_store.feature_io.xodr_curves import simplified
-from gnd.tile_store.feature_io.xodr_road import Road, road_of, value
+from gnd.tile_store.feature_io.xodr_georeference import Georeference, georeference_of
+from gnd.tile_store.feature_io.xodr_lanes import LaneId, lanes_of
+from gnd.tile_store.feature_io.xodr_road import Road, road_of
+from gnd.tile_store.feature_io.xodr_things import Thing, things_of
 
 FORMAT: Final = "opendrive"
 STEP_M: Final = 0.5
 TOLERANCE_M: Final = 0.005
 MAX_SAMPLES: Final = 50_000_000
-MAX_REPEATS: Final = 100_000
-_PLACE: Final = frozenset({"s", "t", "zOffset", "id"})
-ToEarth: TypeAlias = Callable[[F64], tuple[F64, F64, F64]]
-"""From points (N, 3) of the file to latitude, longitude (radians) and height, each (N,)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Thing:
-    """What a road has: its kind, what makes its id, points (N, 3) of the file, attributes."""
-
-    kind: str
-    key: tuple[str | int, ...]
-    points_m: F64
-    attributes: dict[str, str]
 
 
 def read_opendrive(
@@ -71,24 +57,66 @@ def read_opendrive(
     Raises:
         FeatureFileError: one of its family says what is wrong and where.
     """
-    root = read_root(data, where)
-    to_earth = _to_earth(_header(root, where), where, options)
-    roads = _roads(root, where)
-    known = options.placement.height_known if options.placement else True
+    file = read_xodr(data, where, options)
     left_out: Counter[str] = Counter()
-    features = []
-    for number, road in enumerate(roads.values()):
-        for thing in _things(road, roads):
-            layer = options.layer_of(thing.kind)
-            if layer == LEFT_OUT:
+    features: list[MapFeature] = []
+    findings = Findings(options.strict)
+    for number, road in enumerate(file.roads.values()):
+        for thing, feature in drawn_things(file, road, source, options):
+            if feature is None:
                 left_out[thing.kind] += 1
                 continue
-            feature = _feature(thing, layer, road, source, options, to_earth, height_known=known)
-            check_simple(feature)
+            findings.check_simple(feature)
             features.append(feature)
         if progress:
-            progress("reading roads", number, len(roads))
-    return FeatureFile(FORMAT, tuple(features), dict(sorted(left_out.items())))
+            progress("reading roads", number, len(file.roads))
+    lanes: tuple[MapLane, ...] = ()
+    junctions = file.root.all("junction")
+    if options.layer_of("lane_boundary") != LEFT_OUT:
+        lanes = lanes_of(file.roads, junctions, partial(_border_id, source))
+    return FeatureFile(
+        FORMAT, tuple(features), dict(sorted(left_out.items())), data, findings.told(), lanes,
+        {"road": len(file.roads), "junction": len(junctions)},
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class XodrFile:
+    """An OpenDRIVE file: its root, its roads by id, and where its coordinates lie on the Earth."""
+
+    root: Element
+    roads: dict[str, Road]
+    georeference: Georeference
+
+
+def read_xodr(data: bytes, where: str, options: ImportOptions) -> XodrFile:
+    """The roads of a file; errors as `read_opendrive`."""
+    root = read_root(data, where)
+    header = _header(root, where)
+    return XodrFile(root, _roads(root, where), georeference_of(header, where, options))
+
+
+def drawn_things(
+    file: XodrFile, road: Road, source: str, options: ImportOptions
+) -> Iterator[tuple[Thing, MapFeature | None]]:
+    """What a road has, each with its feature; None: its kind has no layer."""
+    known = options.placement.height_known if options.placement else True
+    for thing in (*_borders(road), *things_of(road, file.roads)):
+        layer = options.layer_of(thing.kind)
+        if layer == LEFT_OUT:
+            yield thing, None
+            continue
+        lat, lon, height = file.georeference.to_earth(thing.points_m)
+        yield thing, MapFeature(
+            feature_id_of(FORMAT, source, road.id, *thing.key), thing.kind, layer, lat, lon,
+            height + options.height_offset_m, options.cov_m2(height_known=known), options.existence(),
+            attributes_of({"road": road.id} | thing.attributes), f"{road.where}, {' '.join(map(str, thing.key))}",
+        )  # fmt: skip
+
+
+def _border_id(source: str, lane: LaneId) -> int:
+    """The feature that is the outer border of a lane."""
+    return feature_id_of(FORMAT, source, lane[0], "lane", *lane[1:])
 
 
 def _header(root: Element, where: str) -> Element:
@@ -122,68 +150,7 @@ def _roads(root: Element, where: str) -> dict[str, Road]:
     return roads
 
 
-def _feature(
-    thing: _Thing,
-    layer: str,
-    road: Road,
-    source: str,
-    options: ImportOptions,
-    to_earth: ToEarth,
-    *,
-    height_known: bool,
-) -> MapFeature:
-    lat, lon, height = to_earth(thing.points_m)
-    return MapFeature(
-        feature_id_of(FORMAT, source, road.id, *thing.key), thing.kind, layer, lat, lon,
-        height + options.height_offset_m, options.cov_m2(height_known=height_known), options.existence(),
-        attributes_of({"road": road.id} | thing.attributes), f"{road.where}, {' '.join(map(str, thing.key))}",
-    )  # fmt: skip
-
-
-def _to_earth(header: Element, where: str, options: ImportOptions) -> ToEarth:
-    if options.placement is not None:
-        return options.placement.geodetic
-    reference = header.find("geoReference")
-    text = reference.text.strip() if reference else ""
-    if not text:
-        raise NeedsGeoreference(
-            f"{where}: its header has no geoReference; say --georeference LAT,LON[,HEIGHT[,BEARING]]"
-        )
-    return _by_projection(text, header.find("offset"), where)
-
-
-def _by_projection(text: str, offset: Element | None, where: str) -> ToEarth:
-    try:
-        from pyproj import CRS, Transformer
-        from pyproj.exceptions import ProjError
-    except ImportError:
-        raise MissingLibrary(
-            f"{where}: its geoReference {text!r:.80} needs pyproj (pip install 'gnd-fleet[opendrive]'); or say "
-            "--georeference"
-        ) from None
-    try:
-        transformer = Transformer.from_crs(CRS.from_user_input(text), CRS.from_epsg(4326), always_xy=True)
-    except ProjError as error:
-        raise BadElement(f"{where}: geoReference {text!r:.80}: {error}") from None
-    shift = np.array([value(where, offset, key, 0.0) if offset else 0.0 for key in ("x", "y", "z")])
-    turn = value(where, offset, "hdg", 0.0) if offset else 0.0
-    R = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-
-    def to_earth(points_m: F64) -> tuple[F64, F64, F64]:
-        east, north, height = (points_m @ R.T + shift).T
-        lon_deg, lat_deg = transformer.transform(east, north)
-        return np.radians(lat_deg), np.radians(lon_deg), height.copy()
-
-    return to_earth
-
-
-def _things(road: Road, roads: dict[str, Road]) -> Iterator[_Thing]:
-    yield from _borders(road)
-    yield from _unique(road, _signals(road, roads))
-    yield from _unique(road, _objects(road))
-
-
-def _borders(road: Road) -> Iterator[_Thing]:
+def _borders(road: Road) -> Iterator[Thing]:
     """The outer border of every lane, and lane 0: the line between left and right."""
     for number, section in enumerate(road.sections):
         steps = max(2, int(np.ceil((section.end_m - section.start_m) / STEP_M)) + 1)
@@ -193,85 +160,4 @@ def _borders(road: Road) -> Iterator[_Thing]:
             t = road.lane_offset.at(inside) + section.border_m(lane_id, inside)
             told = {"lane": str(lane_id), "lane_type": lane.type, "mark": lane.mark, "section": str(number)}
             told |= {"color": lane.colour} if lane.colour else {}
-            yield _Thing("lane_boundary", ("lane", number, lane_id), simplified(road.points_m(s, t), TOLERANCE_M), told)
-
-
-def _unique(road: Road, things: Iterator[_Thing]) -> Iterator[_Thing]:
-    seen = set()
-    for thing in things:
-        if thing.key in seen:
-            raise DuplicateId(f"{road.where}: {' '.join(map(str, thing.key))} comes twice")
-        seen.add(thing.key)
-        yield thing
-
-
-def _signals(road: Road, roads: dict[str, Road]) -> Iterator[_Thing]:
-    parent = road.element.find("signals")
-    for signal in parent.all("signal") if parent else ():
-        kind = "traffic_light" if signal.attributes.get("dynamic") == "yes" else "traffic_sign"
-        yield _Thing(kind, ("signal", _id(road, signal)), _signal_m(road, roads, signal), _told(signal))
-
-
-def _signal_m(road: Road, roads: dict[str, Road], signal: Element) -> F64:
-    """(1, 3): where the signal stands, which may be elsewhere than where it holds."""
-    inertial, other = signal.find("positionInertial"), signal.find("positionRoad")
-    if inertial is not None:
-        return np.array([[value(road.where, inertial, key) for key in "xyz"]])
-    if other is not None:
-        told = other.attributes.get("roadId", "")
-        if told not in roads:
-            raise BadElement(f"{road.where}, line {other.line}: stands at road {told!r:.40}, which is not in the file")
-        return _place_m(roads[told], other)
-    return _place_m(road, signal)
-
-
-def _place_m(road: Road, element: Element, s_m: float | None = None, t_m: float | None = None) -> F64:
-    s = value(road.where, element, "s") if s_m is None else s_m
-    t = value(road.where, element, "t") if t_m is None else t_m
-    if not -1e-6 <= s <= road.length_m + 1e-6:
-        raise BadElement(f"{road.where}, line {element.line}: s {s} m is not on its road of {road.length_m} m")
-    return road.points_m(np.array([s]), np.array([t]), value(road.where, element, "zOffset", 0.0))
-
-
-def _objects(road: Road) -> Iterator[_Thing]:
-    parent = road.element.find("objects")
-    for element in parent.all("object") if parent else ():
-        kind, name = _object_kind(element), _id(road, element)
-        repeats = [one for one in element.all("repeat") if value(road.where, one, "distance") > 0]
-        if not repeats:
-            yield _Thing(kind, ("object", name), _place_m(road, element), _told(element))
-        for number, repeat in enumerate(repeats):
-            for k, (s, t) in enumerate(_repeated(road, repeat)):
-                yield _Thing(kind, ("object", name, number, k), _place_m(road, element, s, t), _told(element))
-
-
-def _repeated(road: Road, repeat: Element) -> list[tuple[float, float]]:
-    """(s, t) of every copy."""
-    start, length, distance = (value(road.where, repeat, key) for key in ("s", "length", "distance"))
-    ends = value(road.where, repeat, "tStart"), value(road.where, repeat, "tEnd")
-    if not 0 <= length / distance <= MAX_REPEATS:
-        raise FileTooLarge(
-            f"{road.where}, line {repeat.line}: {length / distance:.0f} copies, the limit is {MAX_REPEATS}"
-        )
-    along = np.arange(0.0, length + 1e-9, distance)
-    across = np.interp(along, [0.0, max(length, 1e-9)], ends)
-    return list(zip((start + along).tolist(), across.tolist(), strict=True))
-
-
-def _object_kind(element: Element) -> str:
-    type_, subtype = element.attributes.get("type", "none"), element.attributes.get("subtype", "")
-    if "streetLamp" in (type_, subtype):
-        return "streetlight"
-    kind = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type_).lower()
-    return kind if KIND_PATTERN.fullmatch(kind) else "unknown"
-
-
-def _id(road: Road, element: Element) -> str:
-    found = element.attributes.get("id")
-    if not found:
-        raise BadElement(f"{road.where}, line {element.line}: <{element.name}> without id")
-    return found
-
-
-def _told(element: Element) -> dict[str, str]:
-    return {key: text for key, text in element.attributes.items() if key not in _PLACE}
+            yield Thing("lane_boundary", ("lane", number, lane_id), simplified(road.points_m(s, t), TOLERANCE_M), told)

@@ -6,7 +6,7 @@ version in the root). Only what features need is read; the bytes keep the rest.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import isfinite
+from math import isfinite, nan
 from typing import Final, TypeVar
 
 from gnd.tile_store.feature_io.errors import BadElement, DuplicateId, FileTooLarge, MissingReference, UnknownFormat
@@ -16,7 +16,6 @@ MAX_FILE_BYTES: Final = 1_000_000_000
 MAX_NODES: Final = 1_000_000
 MAX_ID: Final = 2**63 - 1
 VERSIONS: Final = ("0.6",)
-META_VERSIONS: Final = ("1",)
 _EVERY: Final = 10_000
 
 Progress = Callable[[str, int, int], None]
@@ -39,7 +38,7 @@ _T = TypeVar("_T", bound=OsmElement)
 
 @dataclass(frozen=True, slots=True)
 class OsmNode(OsmElement):
-    """A node: degrees."""
+    """A node: degrees; NaN where only local coordinates are given."""
 
     lat_deg: float
     lon_deg: float
@@ -126,9 +125,7 @@ class _OsmReading:
         self._count += 1
         if self._progress and self._count % _EVERY == 0:
             self._progress("reading", element.end, len(self._to.data))
-        if element.name == "MetaInfo":
-            self._check_meta(element)
-        elif element.name in ("node", "way", "relation"):
+        if element.name in ("node", "way", "relation"):
             if element.name == "node":
                 self._to.end_of_nodes = element.end
             elif element.name == "way":
@@ -148,14 +145,6 @@ class _OsmReading:
             _put(where, self._to.ways, OsmWay(*common, refs))
         else:
             _put(where, self._to.relations, OsmRelation(*common, _members(where, element)))
-
-    def _check_meta(self, element: Element) -> None:
-        version = element.attributes.get("format_version")
-        if version is not None and version not in META_VERSIONS:
-            raise UnknownFormat(
-                f"{self._to.where}, line {element.line}: map format {version!r:.20}, "
-                f"known is {', '.join(META_VERSIONS)}"
-            )
 
 
 def _put(where: str, table: dict[int, _T], element: _T) -> None:
@@ -180,6 +169,8 @@ def number(where: str, element: Element, name: str) -> int:
 
 def _degrees(where: str, element: Element, name: str) -> float:
     text = element.attributes.get(name)
+    if not text and {"local_x", "local_y"} <= {tag.attributes.get("k") for tag in element.all("tag")}:
+        return nan  # editors of local maps leave the attribute empty
     if text is None:
         raise BadElement(f"{where}: node {element.attributes.get('id')} has no {name}, so no position")
     return real(where, f"{name} of node {element.attributes.get('id')}", text)

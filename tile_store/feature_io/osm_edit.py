@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import isnan
 from typing import Final
 
 from gnd.tile_store.feature_io.osm_document import OsmElement
@@ -26,7 +27,7 @@ class Edits:
     def applied(self, data: bytes) -> bytes:
         """The bytes after all changes."""
         parts, at = [], 0
-        for start, end, new in sorted(self._cuts):
+        for start, end, new in sorted(self._cuts, key=lambda cut: cut[:2]):  # at one place: as they came
             parts += [data[at:start], new]
             at = end
         return b"".join((*parts, data[at:]))
@@ -121,6 +122,13 @@ def way_lines(way_id: int, refs: Iterable[int], tags: Mapping[str, str]) -> byte
     return _closed(b'\n  <way id="%d"' % way_id, b"way", inside)
 
 
+def relation_lines(relation_id: int, members: Iterable[tuple[str, int, str]], tags: Mapping[str, str]) -> bytes:
+    """A relation that begins on a new line; members are type, id and role."""
+    inside = [b'<member type="%s" ref="%d" role="%s"/>' % (escaped(t), ref, escaped(role)) for t, ref, role in members]
+    inside += [tag_line(*item) for item in tags.items()]
+    return _closed(b'\n  <relation id="%d"' % relation_id, b"relation", inside)
+
+
 def _closed(head: bytes, name: bytes, inside: list[bytes]) -> bytes:
     if not inside:
         return head + b"/>"
@@ -128,7 +136,7 @@ def _closed(head: bytes, name: bytes, inside: list[bytes]) -> bytes:
 
 
 def _degrees(value: float) -> bytes:
-    return f"{value:.11f}".encode()
+    return b"" if isnan(value) else degrees(value).encode()
 
 
 def degrees(value: float) -> str:

@@ -4,6 +4,7 @@ Sources: Lanelet2's LinestringsAndPolygonTagging.md and RegulatoryElementTagging
 Key:highway, Key:traffic_sign, Key:man_made, Key:power.
 """
 
+import re
 from collections.abc import Mapping
 from typing import Final
 
@@ -34,13 +35,15 @@ _NATIVE: Final = (
     ("man_made", "utility_pole", "pole"),
     ("power", "pole", "pole"),
 )
+_NO_KIND: Final = re.compile(r"[^a-z0-9_]")
+"""Lanelet2 has types such as "zig-zag"; the kind of the feature is zig_zag."""
 POSITION_TAGS: Final = frozenset({"local_x", "local_y", "ele", "mgrs_code"})
 """Tags that say where an element is, not what."""
 
 
 def kind_of(tags: Mapping[str, str], *, border: bool = False) -> str | None:
     """The kind of feature that an element is, or None; `border`: a lanelet names it as a border."""
-    said = tags.get("type", "")
+    said = _NO_KIND.sub("_", tags.get("type", "").lower())
     kind = _SAME.get(said, said)
     if kind not in POINT_KINDS and (border or kind in BOUNDARIES):
         return "lane_boundary"

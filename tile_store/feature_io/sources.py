@@ -15,6 +15,7 @@ import zstandard
 
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.feature_io.errors import FeatureFileError
+from gnd.tile_store.feature_io.lane_network import MapLane, lane_of
 from gnd.tile_store.sqlite_connection import change, fetch
 
 MAX_DOCUMENT_BYTES: Final = 1_000_000_000
@@ -26,7 +27,7 @@ class FeatureSource:
     """One file that was imported.
 
     name: what its features are known by. format: "lanelet2", "geojson", ... ids: of its features by layer.
-    options: how it was read. document: its bytes, b"" when the format has no remainder to keep.
+    options: how it was read. document: its bytes, b"" when the format has no remainder to keep. lanes: its lanes.
     """
 
     name: str
@@ -34,6 +35,7 @@ class FeatureSource:
     ids: Mapping[str, tuple[int, ...]]
     options: Mapping[str, Any]
     document: bytes = field(default=b"", repr=False)
+    lanes: tuple[MapLane, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.name) <= 200:
@@ -43,7 +45,8 @@ class FeatureSource:
 def put_source(c: apsw.Connection, source: FeatureSource, now_ns: int) -> None:
     """Keep a source in place of one of the same name; inside the caller's transaction."""
     ids = {layer: list(numbers) for layer, numbers in source.ids.items()}
-    about = {"format": source.format, "options": dict(source.options), "ids": ids}
+    lanes = [lane.as_list() for lane in source.lanes]
+    about = {"format": source.format, "options": dict(source.options), "ids": ids, "lanes": lanes}
     c.execute("CREATE TABLE IF NOT EXISTS " + TABLE)
     body = zstandard.compress(source.document, _LEVEL)
     row = {"name": source.name, "created_ns": now_ns, "about": json.dumps(about), "body": body}
@@ -69,6 +72,7 @@ def _source(name: str, about: str, body: bytes) -> FeatureSource:
         told = json.loads(about)
         document = zstandard.ZstdDecompressor().decompress(body, max_output_size=MAX_DOCUMENT_BYTES)
         ids = {layer: tuple(map(int, numbers)) for layer, numbers in told["ids"].items()}
-        return FeatureSource(name, told["format"], ids, told["options"], document)
-    except (ValueError, KeyError, TypeError, AttributeError, zstandard.ZstdError) as error:
+        lanes = tuple(map(lane_of, told.get("lanes", ())))
+        return FeatureSource(name, told["format"], ids, told["options"], document, lanes)
+    except (FeatureFileError, ValueError, KeyError, TypeError, AttributeError, zstandard.ZstdError) as error:
         raise StoreError(f"source {name!r:.80} of the store is damaged: {type(error).__name__}: {error}") from None

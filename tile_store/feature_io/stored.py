@@ -11,6 +11,7 @@ from gnd.gnd_map.features import MAX_FEATURES_OF_TILE, Feature, FeatureTile, is_
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import sqlite_versions as versions
 from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
+from gnd.tile_store.feature_io.lane_network import counted
 from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.sources import FeatureSource, get_sources, put_source
 from gnd.tile_store.feature_io.tiling import cut, whole
@@ -25,7 +26,8 @@ _EVERY: Final = 64
 @dataclass(frozen=True, slots=True)
 class ImportResult:
     """What an import did. tiles: that it published; unchanged: that held the same already. features: put, by layer;
-    removed: that an earlier import of the same source had put and this file has no more; left_out: by kind.
+    removed: that an earlier import of the same source had put and this file has no more; left_out: by kind. lanes: how
+    many lanes, of them with a successor and with a neighbour; kept: what the file keeps that is no feature, by type.
     """
 
     source: str
@@ -35,7 +37,9 @@ class ImportResult:
     tiles: int
     unchanged: int
     left_out: Mapping[str, int]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    lanes: Mapping[str, int] = field(default_factory=dict)
+    kept: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +83,8 @@ def import_features(
     old = known[source].ids if source in known else {}
     puts, removed = _puts(store, file, old, progress)
     ids = {layer: tuple(sorted(f.feature_id for f in file.features if f.layer == layer)) for layer in file.layers}
-    kept = _kept(FeatureSource(source, file.format, ids, options or {}, file.document or b""), known.get(source))
+    new = FeatureSource(source, file.format, ids, options or {}, file.document or b"", file.lanes)
+    kept = _kept(new, known.get(source))
 
     def work(c: apsw.Connection, now: int) -> int:
         published = sum(_put(c, one, now) for one in puts)
@@ -88,15 +93,16 @@ def import_features(
 
     published = store.transact(work)
     return ImportResult(
-        source, file.format, file.layers, removed, published, len(puts) - published, file.left_out, file.notes
-    )
+        source, file.format, file.layers, removed, published, len(puts) - published, file.left_out, file.notes,
+        counted(file.lanes), file.kept,
+    )  # fmt: skip
 
 
 def _kept(new: FeatureSource, before: FeatureSource | None) -> FeatureSource:
-    """What is kept of a source: features that come back from an editor without their document keep it."""
-    if before is None or new.document or not before.document:
+    """What is kept of a source: features that come back from an editor keep their document and their lanes."""
+    if before is None or new.document or new.lanes or not (before.document or before.lanes):
         return new
-    return FeatureSource(new.name, before.format, new.ids, before.options, before.document)
+    return FeatureSource(new.name, before.format, new.ids, before.options, before.document, before.lanes)
 
 
 def _put(c: apsw.Connection, one: _Put, now: int) -> bool:

@@ -23,6 +23,7 @@ from gnd.gnd_map.features.feature import KIND_PATTERN, MAX_ATTRIBUTES, MAX_KEY_C
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.schemas.limits import MAX_FLOOR, MIN_FLOOR
 from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError, FileTooLarge
+from gnd.tile_store.feature_io.lane_network import MapLane, check_lanes
 from gnd.tile_store.feature_io.placement import Placement
 from gnd.tile_store.values import check_layer
 
@@ -46,6 +47,8 @@ SIGMA_M: Final = 0.1
 """One sigma of an axis of what a file holds, which no format but our GeoJSON states; HD maps are within 10 to 20 cm
 (SLAMCU, section 1)."""
 MAX_VERTICES_OF_LINE: Final = 20_000
+MAX_NOTES: Final = 20
+"""So many findings are written out; the rest is counted."""
 _LATITUDE_LIMIT: Final = pi / 2
 _SLACK: Final = 1e-12
 
@@ -61,6 +64,7 @@ class ImportOptions:
     height_offset_m: added to the file's heights, which makes them ellipsoidal: the geoid's height there, when they are
         above the sea.
     sigma_m, sigma_up_m: of the positions; exist: mass of their existence.
+    strict: lines and borders that cross refuse the file; otherwise they are reported and kept.
     """
 
     layers: Mapping[str, str] = field(default_factory=dict)
@@ -71,6 +75,7 @@ class ImportOptions:
     sigma_m: float = SIGMA_M
     sigma_up_m: float = SIGMA_M
     exist: float = SURE
+    strict: bool = False
 
     def __post_init__(self) -> None:
         for layer in (*self.layers.values(), *([] if self.other is None else [self.other])):
@@ -153,15 +158,39 @@ def check_positions(name: str, lat_rad: F64, lon_rad: F64, height_m: F64) -> Non
         raise BadGeometry(f"{name}: height {height_m[np.argmax(bad)]:.1f} m is not in {MIN_FLOOR} … {MAX_FLOOR} m")
 
 
-def check_simple(feature: MapFeature) -> None:
-    """BadGeometry when a polyline crosses itself, FileTooLarge when it has too many vertices to tell."""
-    check_vertices(feature.name, len(feature))
-    if len(feature) < 3:
-        return
-    try:
-        check_simple_polyline(feature.name, feature.enu_m())
-    except FeatureError as error:
-        raise BadGeometry(str(error)) from None
+@dataclass(slots=True)
+class Findings:
+    """What is odd about a file's geometry but loses nothing: it is reported, or with `strict` refused.
+
+    Attributes:
+        strict: whether the first finding refuses the file.
+        notes: the findings so far.
+    """
+
+    strict: bool
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, finding: str) -> None:
+        """Keep a finding; BadGeometry when it refuses the file."""
+        if self.strict:
+            raise BadGeometry(finding)
+        self.notes.append(finding)
+
+    def check_simple(self, feature: MapFeature) -> None:
+        """A finding when a polyline crosses itself; FileTooLarge when it has too many vertices to tell."""
+        check_vertices(feature.name, len(feature))
+        if len(feature) < 3:
+            return
+        try:
+            check_simple_polyline(feature.name, feature.enu_m())
+        except FeatureError as error:
+            self.add(str(error))
+
+    def told(self) -> tuple[str, ...]:
+        """The findings, the first of them in full."""
+        more = len(self.notes) - MAX_NOTES
+        rest = (f"and {more} more findings (--strict refuses the file)",) if more > 0 else ()
+        return (*self.notes[:MAX_NOTES], *rest)
 
 
 def check_vertices(name: str, n: int) -> None:
@@ -183,7 +212,8 @@ class FeatureFile:
     """What one file holds.
 
     format: its name. features: those with a layer. left_out: how many of each kind have none. document: the file's
-    bytes, when what was not understood can be given back on export (Lanelet2); notes: what a reader should know.
+    bytes, when what was not understood can be given back on export (Lanelet2, OpenDRIVE); notes: what a reader should
+    know. lanes: between which of the features lanes run. kept: what the document keeps that is no feature, by type.
     """
 
     format: str
@@ -191,9 +221,12 @@ class FeatureFile:
     left_out: Mapping[str, int]
     document: bytes | None = field(default=None, repr=False)
     notes: tuple[str, ...] = ()
+    lanes: tuple[MapLane, ...] = field(default=(), repr=False)
+    kept: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_unique(self.features)
+        check_lanes(self.lanes, (feature.feature_id for feature in self.features))
 
     @property
     def layers(self) -> dict[str, int]:

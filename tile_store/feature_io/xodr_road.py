@@ -9,7 +9,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.tile_store.feature_io.errors import BadElement
-from gnd.tile_store.feature_io.osm_document import real
+from gnd.tile_store.feature_io.osm_document import number, real
 from gnd.tile_store.feature_io.xml_spans import Element
 from gnd.tile_store.feature_io.xodr_curves import (
     Curve,
@@ -25,11 +25,16 @@ from gnd.tile_store.feature_io.xodr_curves import (
 
 _COEFFICIENTS: Final = ("a", "b", "c", "d")
 MAX_ROAD_M: Final = 1_000_000.0
+_SAMPLE_M: Final = 0.5
+_ROUNDS: Final = 20
+"""Of stepping along the road to the foot of a perpendicular: each takes off the curvature times the distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class XodrLane:
-    """A lane: id (left positive), type, width or border along it, and its first mark."""
+    """A lane: id (left positive), type, width or border along it, its first mark, speed limit, and the lanes at its
+    start and its end in s.
+    """
 
     id: int
     type: str
@@ -37,6 +42,10 @@ class XodrLane:
     border: HeightProfile | None
     mark: str
     colour: str
+    speed: str
+    reversed: bool
+    predecessors: tuple[int, ...]
+    successors: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +87,39 @@ class Road:
         across, up = t_m * np.cos(roll) - up_m * np.sin(roll), t_m * np.sin(roll) + up_m * np.cos(roll)
         z = self.elevation.at(s_m) + up
         return np.column_stack([x - across * np.sin(heading), y + across * np.cos(heading), z])
+
+    def place_of(self, point_m: F64) -> tuple[float, float, float]:
+        """s, t and height above the surface of a point (3,): the inverse of `points_m`, at the nearest place."""
+        samples = np.linspace(0.0, self.length_m, max(2, int(self.length_m / _SAMPLE_M) + 2))
+        x, y, _ = self.plan.at(samples)
+        s = float(samples[np.hypot(x - point_m[0], y - point_m[1]).argmin()])
+        for _ in range(_ROUNDS):
+            off, heading = self._off(s, point_m)
+            s = float(np.clip(s + off @ [np.cos(heading), np.sin(heading)], 0.0, self.length_m))
+        off, heading = self._off(s, point_m)
+        across, at = float(off @ [-np.sin(heading), np.cos(heading)]), np.array([s])
+        up, roll = float(point_m[2] - self.elevation.at(at)[0]), float(self.superelevation.at(at)[0])
+        return s, across * np.cos(roll) + up * np.sin(roll), up * np.cos(roll) - across * np.sin(roll)
+
+    def _off(self, s_m: float, point_m: F64) -> tuple[F64, float]:
+        x, y, heading = self.plan.at(np.array([s_m]))
+        return np.array([point_m[0] - x[0], point_m[1] - y[0]]), float(heading[0])
+
+    def heading_rad(self, s_m: float) -> float:
+        """Direction of the reference line at a distance."""
+        return float(self.plan.at(np.array([s_m]))[2][0])
+
+    def lane_t_m(self, s_m: float, lane_id: int) -> float:
+        """Lateral place of the outer border of a lane (0: of the lane reference) at a distance; of the last lane there
+        is on that side when there are fewer.
+        """
+        section = next((one for one in reversed(self.sections) if one.start_m <= s_m), None)
+        offset_m = float(self.lane_offset.at(np.array([s_m]))[0])
+        if section is None:
+            return offset_m
+        while lane_id not in section.lanes and lane_id:
+            lane_id -= 1 if lane_id > 0 else -1
+        return offset_m + float(section.border_m(lane_id, np.array([s_m]))[0])
 
 
 def road_of(element: Element, where: str) -> Road:
@@ -163,6 +205,9 @@ def _lanes(where: str, section: Element) -> dict[int, XodrLane]:
             if lane.id in found:
                 raise BadElement(f"{where}, line {element.line}: lane {lane.id} comes twice in a section")
             found[lane.id] = lane
+    if found and 0 not in found:  # required by the standard, and left out by some writers
+        empty = profile(where, None, "width", "sOffset")
+        found[0] = XodrLane(0, "none", empty, None, "none", "", "", False, (), ())
     for sign in (1, -1):
         ids = sorted(abs(id_) for id_ in found if id_ * sign > 0)
         if ids != list(range(1, len(ids) + 1)):
@@ -173,13 +218,38 @@ def _lanes(where: str, section: Element) -> dict[int, XodrLane]:
 
 
 def _lane(where: str, element: Element) -> XodrLane:
-    number = value(where, element, "id")
-    if not number.is_integer():
-        raise BadElement(f"{where}, line {element.line}: lane id {number} is no whole number")
+    lane_id = value(where, element, "id")
+    if not lane_id.is_integer():
+        raise BadElement(f"{where}, line {element.line}: lane id {lane_id} is no whole number")
     mark = element.find("roadMark")
     said = mark.attributes if mark else {}
     return XodrLane(
-        int(number), element.attributes.get("type", "none"), profile(where, element, "width", "sOffset"),
+        int(lane_id), element.attributes.get("type", "none"), profile(where, element, "width", "sOffset"),
         profile(where, element, "border", "sOffset") if element.find("border") else None,
-        said.get("type", "none"), said.get("color", ""),
+        _left_first(said.get("type", "none"), left=lane_id > 0), said.get("color", ""),
+        speed_of(where, element), element.attributes.get("direction") == "reversed",
+        _linked(where, element, "predecessor"), _linked(where, element, "successor"),
     )  # fmt: skip
+
+
+def _left_first(mark: str, *, left: bool) -> str:
+    """A mark with its left stripe first: OpenDRIVE names stripes from the inside of the road to its outside."""
+    words = mark.split()
+    return " ".join(words[::-1]) if left and sorted(words) == ["broken", "solid"] else mark
+
+
+def _linked(where: str, lane: Element, name: str) -> tuple[int, ...]:
+    link = lane.find("link")
+    return tuple(number(where, one, "id") for one in (link.all(name) if link else ()))
+
+
+_UNITS: Final = {"km/h": "km/h", "mph": "mph", "m/s": "m/s"}
+
+
+def speed_of(where: str, element: Element) -> str:
+    """The first speed limit below an element as Lanelet2 writes it, "" without one."""
+    speed = element.find("speed")
+    told = speed.attributes.get("max", "") if speed else ""
+    if speed is None or told in ("", "no limit", "undefined"):
+        return ""
+    return f"{value(where, speed, 'max'):g} {_UNITS.get(speed.attributes.get('unit', 'm/s'), 'm/s')}"

@@ -1,10 +1,9 @@
 """Where a drive has looked: the cells of each tile in which it would have confirmed a feature had there been one.
 
-A fleet can only forget a feature, or a false one never come to be, when vehicles say where they looked and saw nothing.
-Each tile has 8 x 8 cells of some 4 m (`gnd.schemas.feature_change.cell_of`): eight bytes say it.
+A fleet can forget a feature, and reject a false one, only when vehicles report where they looked and saw nothing.
+Each tile has 8 x 8 cells of some 4 m (`gnd.schemas.feature_change.cell_of`): eight bytes.
 """
 
-from dataclasses import dataclass
 from math import cos, hypot, sin
 from typing import Final
 
@@ -12,29 +11,14 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinates
 from gnd.schemas.feature_change import GRID
-from gnd.vehicle_agent.features.errors import FeatureLayerError
 from gnd.vehicle_agent.features.view import Occlusion, SensorView
 
+LOOKS: Final = 4
+LOOK_STEP_M: Final = 1.0
 _BASE_M: Final = 100.0
 """Cells are laid by a linear map about the vehicle, measured over this length and within it exact to a millimetre."""
-
-
-@dataclass(frozen=True, slots=True)
-class CoverageParameters:
-    """When a cell counts as looked at."""
-
-    looks: int = setting(
-        4,
-        "From so many places a feature in the cell would have been in view and not hidden.",
-        least=1,
-    )
-    step_m: float = setting(1.0, "Places are so far apart.", unit="m", above=0)
-
-    def __post_init__(self) -> None:
-        check_settings(self, FeatureLayerError)
 
 
 class Coverage:
@@ -44,11 +28,14 @@ class Coverage:
         frame: the map frame.
         view: of the sensor.
         height_m: of the features looked for, above the vehicle's origin.
-        parameters: when a cell counts as looked at.
+        looks: from so many places a feature in a cell would have been in view and not hidden, or it does not count.
+        step_m: places are so far apart.
     """
 
-    def __init__(self, frame: LocalFrame, view: SensorView, height_m: float, parameters: CoverageParameters) -> None:
-        self._frame, self._view, self._height_m, self._parameters = frame, view, height_m, parameters
+    def __init__(
+        self, frame: LocalFrame, view: SensorView, height_m: float, looks: int = LOOKS, step_m: float = LOOK_STEP_M
+    ) -> None:
+        self._frame, self._view, self._height_m, self._least, self._step_m = frame, view, height_m, looks, step_m
         self._looks: dict[TileId, I32] = {}
         self._looked_at: tuple[float, float] | None = None
 
@@ -67,7 +54,7 @@ class Coverage:
             occlusion: what hides features here; None = nothing.
         """
         before = self._looked_at
-        if before is not None and hypot(x_m - before[0], y_m - before[1]) < self._parameters.step_m:
+        if before is not None and hypot(x_m - before[0], y_m - before[1]) < self._step_m:
             return False
         self._looked_at = x_m, y_m
         for tile, cells in self._in_view(x_m, y_m, heading_rad, occlusion).items():
@@ -79,7 +66,7 @@ class Coverage:
         looks = self._looks.get(tile)
         if looks is None:
             return 0
-        return sum(1 << int(cell) for cell in np.flatnonzero(looks >= self._parameters.looks))
+        return sum(1 << int(cell) for cell in np.flatnonzero(looks >= self._least))
 
     def touched(self, tile: TileId) -> bool:
         """Whether any of the tile's cells was in view."""

@@ -11,10 +11,11 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.features import Existence, FeatureTile
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureChange, Found, Seen
-from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
+from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
-from gnd.vehicle_agent.features.layer_parameters import LayerParameters
+from gnd.vehicle_agent.features.layer_parameters import slamcu_of, view_of
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
@@ -23,7 +24,7 @@ from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.surroundings import left_behind
 
 SIGMA_HEIGHT_M: Final = 0.5
-"""Of a height that a detector has told."""
+"""Of a height as a detector measures it."""
 AGAIN_M: Final = 1.5
 """A detection of another kind of the same detector this near to a feature of the layer is that feature: the head of a
 lamp is not seen from everywhere, and then its mast is a pole."""
@@ -52,24 +53,23 @@ class FeatureLayer:
 
     Args:
         parameters: the layer, its sensor.
-        coverage: when a place counts as looked at.
         frame: the map frame.
     """
 
     def __init__(
         self,
         parameters: LayerParameters,
-        coverage: CoverageParameters,
         frame: LocalFrame,
         slamcu: Slamcu | WatchedSlamcu | None = None,
     ) -> None:
-        self.parameters, self._frame = parameters, frame
-        self._slamcu = slamcu or Slamcu(parameters.slamcu, MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
-        self._coverage = Coverage(frame, parameters.view, parameters.height_m, coverage)
+        self.parameters, self._frame, self._view = parameters, frame, view_of(parameters)
+        self._slamcu = slamcu or Slamcu(slamcu_of(parameters), MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
+        self._coverage = Coverage(frame, self._view, parameters.height_m)
         self._held: dict[TileId, FeatureTile] = {}
         self._ids: dict[TileId, tuple[int, ...]] = {}
-        self._told: set[int] = set()
+        self._reported: set[int] = set()
         self._z_m = 0.0
+        self._before: PlacedLook | None = None
 
     @property
     def tiles(self) -> list[TileId]:
@@ -94,15 +94,23 @@ class FeatureLayer:
     def see(self, placed: PlacedLook, occlusion: Occlusion | None) -> None:
         """Take one look from a known pose."""
         assert isinstance(self._slamcu, Slamcu), "this layer's own filter finds the poses"
+        self._drive_on(placed, self._slamcu)
         self._slamcu.set_pose(placed.pose, placed.cov, placed.z_m)
-        self._slamcu.look(self._own(placed), self.parameters.view, occlusion)
+        self._slamcu.look(self._own(placed), self._view, occlusion)
         self.cover(placed.pose, occlusion)
         self._z_m = placed.z_m
 
+    def _drive_on(self, placed: PlacedLook, slamcu: Slamcu) -> None:
+        """Time and way since the look before: features settle once they are out of view and left behind."""
+        before, self._before = self._before, placed
+        dt_s = 0.0 if before is None else (placed.look.t_ns - before.look.t_ns) * 1e-9
+        if before is not None and dt_s > 0.0:
+            slamcu.predict(dt_s, float(np.hypot(*(placed.pose - before.pose)[:2])) / dt_s, 0.0)
+
     def look(self, look: Look, occlusion: Occlusion | None) -> None:
-        """Take one look whose pose the filter finds; where it has looked is told later, by `cover`."""
+        """Take one look whose pose the filter finds; where it has looked comes later, by `cover`."""
         rows = np.array([i for i, kind in enumerate(look.kinds) if kind in self.parameters.kinds], np.int64)
-        self._slamcu.look(taken(look, rows, [look.kinds[i] for i in rows]), self.parameters.view, occlusion)
+        self._slamcu.look(taken(look, rows, [look.kinds[i] for i in rows]), self._view, occlusion)
 
     def cover(self, pose: F64, occlusion: Occlusion | None) -> None:
         """The vehicle has looked from a pose (3,): x, y [m], heading [rad] in the map frame."""
@@ -110,7 +118,7 @@ class FeatureLayer:
         self._coverage.look(x_m, y_m, heading_rad, occlusion)
 
     def leave(self, p_map_m: F64, distance_m: float) -> list[FeatureChange]:
-        """What is to be said of the tiles farther away than `distance_m` from points (3,) or (N, 3); they are
+        """What is to be reported of the tiles farther away than `distance_m` from points (3,) or (N, 3); they are
         forgotten.
         """
         left = self.tiles
@@ -119,7 +127,7 @@ class FeatureLayer:
         return self._decided(left)
 
     def leave_all(self) -> list[FeatureChange]:
-        """The drive has ended: what is to be said of every tile."""
+        """The drive has ended: what is to be reported of every tile."""
         return self._decided(self.tiles)
 
     # What a look means for this layer
@@ -131,9 +139,9 @@ class FeatureLayer:
         ahead, left = look.range_m * np.cos(look.bearing_rad), look.range_m * np.sin(look.bearing_rad)
         xy = placed.pose[:2] + np.column_stack([c * ahead - s * left, s * ahead + c * left])
         near = self._at_features(xy)
-        told = [kind if kind in kinds else near[i] for i, kind in enumerate(look.kinds)]
-        rows = np.array([i for i, kind in enumerate(told) if kind], np.int64)
-        return taken(look, rows, [told[i] for i in rows])
+        own = [kind if kind in kinds else near[i] for i, kind in enumerate(look.kinds)]
+        rows = np.array([i for i, kind in enumerate(own) if kind], np.int64)
+        return taken(look, rows, [own[i] for i in rows])
 
     def _at_features(self, xy_m: F64) -> list[str]:
         """The kind of the layer's feature at each of some places, empty where there is none."""
@@ -153,7 +161,7 @@ class FeatureLayer:
         kinds = [*(kind for one in held for kind in one.kind), *(one.kind for one in found)]
         return np.concatenate(places) if kinds else np.zeros((0, 2)), kinds
 
-    # What is said of a tile
+    # What is reported of a tile
 
     def _decided(self, tiles: Sequence[TileId]) -> list[FeatureChange]:
         if not tiles:
@@ -193,8 +201,8 @@ class FeatureLayer:
         places = np.array([one.position_m for one in new]).reshape(-1, 2)
         for one in new:
             tile, point, cov = self._placed(one.position_m, one.cov_m2, one.height_m)
-            if tile == tile_id and one.number not in self._told and self._alone(one.position_m, places):
-                self._told.add(one.number)
+            if tile == tile_id and one.number not in self._reported and self._alone(one.position_m, places):
+                self._reported.add(one.number)
                 found.append(Found(one.kind, point, cov, bounded(one.existence), one.hits))
         return found
 
@@ -216,7 +224,7 @@ def taken(look: Look, rows: I64, kinds: Sequence[str]) -> Look:
 
 
 def of_counts(hits: int, misses: int, confidence: float) -> Existence:
-    """Masses of so many detections and misses, begun vacuous: what this drive alone says. SLAMCU, Eq. (1), (2), (5).
+    """Masses of so many detections and misses, begun vacuous: this drive's own evidence. SLAMCU, Eq. (1), (2), (5).
 
     Combined in closed form: with u = (1 - λ)^n of either kind, m(∃) ∝ (1 - u_hit) u_miss, m(∄) ∝ (1 - u_miss) u_hit,
     m(Ω) ∝ u_hit u_miss, whatever their order.

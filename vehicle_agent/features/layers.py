@@ -19,7 +19,6 @@ from gnd.schemas.drive import Detections
 from gnd.schemas.features import FeatureChange
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
-from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
 from gnd.vehicle_agent.features.layer_parameters import MARGIN_M, FeatureParameters
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, Look
@@ -64,7 +63,7 @@ class FeatureLayers:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._parameters, self._report = parameters, report
-        self.layers = {one.name: FeatureLayer(one, CoverageParameters(), frame) for one in parameters.layers}
+        self.layers = {one.name: FeatureLayer(one, frame) for one in parameters.layers}
         self._reporters = dict(zip(self.layers, reporters, strict=True))
         self._detector = PoleDetector()
         self._looks: deque[Detections] = deque(maxlen=MOST_WAITING)
@@ -99,14 +98,14 @@ class FeatureLayers:
         self._leave_behind(scan.estimate.T_map_vehicle[:3, 3], odometer_m)
 
     def finish(self) -> None:
-        """The drive has ended: say everything."""
+        """The drive has ended: report everything."""
         for name, layer in self.layers.items():
             for change in layer.leave_all():
                 self._say(name, change, 0.0)
             self._reporters[name].report_all(self._t_ns)
 
     def take_back(self) -> None:
-        """The pose was wrong, and it is not known since when: nothing is said of the tiles that are in sight."""
+        """The pose was wrong, and it is not known since when: nothing is reported of the tiles in sight."""
         self._doubts.count(self._open(), WRONG)
         self._scans.clear()
         self._before = None

@@ -13,7 +13,7 @@ MAX_RANGE_M: Final = 1000.0
 MAX_DETECTIONS: Final = 1024
 """More in one look is no detector's work (the same limit as on the wire)."""
 SMALLEST_SIGMA: Final = 1e-4
-"""m or rad; what claims to be better is taken for this good."""
+"""m or rad; a smaller one is taken as this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class Look:
         sigma_range_m: float64 (N,).
         sigma_bearing_rad: float64 (N,).
         kinds: N words; only equal kinds are associated.
-        height_m: float64 (N,) over the vehicle's origin, nan = unknown; None = the detector cannot tell any.
+        height_m: float64 (N,) over the vehicle's origin, nan = unknown; None = the detector measures none.
     """
 
     t_ns: int

@@ -31,23 +31,14 @@ class SensorView:
     Attributes:
         field_rad: its whole angle; 2π all around.
         range_m: its farthest range.
-        rate_hz: looks a second.
-        nearest_m: its nearest range.
-        towards_rad: direction of its middle, counter-clockwise from the vehicle's x axis.
     """
 
     field_rad: float
     range_m: float
-    rate_hz: float = 15.0
-    nearest_m: float = 0.0
-    towards_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.field_rad, self.range_m, self.rate_hz, self.nearest_m, self.towards_rad)
-        if not (all(map(isfinite, values)) and 0 < self.field_rad <= _TURN + 1e-9 and self.rate_hz > 0):
-            raise BadLook(f"view of {self.field_rad} rad, {self.range_m} m, {self.rate_hz} Hz")
-        if not 0.0 <= self.nearest_m < self.range_m:
-            raise BadLook(f"view from {self.nearest_m} to {self.range_m} m")
+        if not (isfinite(self.range_m) and self.range_m > 0 and 0 < self.field_rad <= _TURN + 1e-9):
+            raise BadLook(f"view of {self.field_rad} rad, {self.range_m} m")
 
     @property
     def all_around(self) -> bool:
@@ -58,17 +49,16 @@ class SensorView:
         self, range_m: F64, bearing_rad: F64, range_edge_m: npt.ArrayLike = 0.0, bearing_edge_rad: npt.ArrayLike = 0.0
     ) -> npt.NDArray[np.bool_]:
         """Which directions (N,) lie in view, farther from its border than the edges (N,) or one for all."""
-        edge_m = np.asarray(range_edge_m)
-        in_range = (range_m <= self.range_m - edge_m) & (range_m >= self.nearest_m + (self.nearest_m > 0) * edge_m)
+        in_range = range_m <= self.range_m - np.asarray(range_edge_m)
         if self.all_around:
             return np.asarray(in_range)
-        off = np.abs(wrapped(bearing_rad - self.towards_rad))
+        off = np.abs(wrapped(bearing_rad))
         return np.asarray(in_range & (off <= 0.5 * self.field_rad - np.asarray(bearing_edge_rad)))
 
 
-CAMERA: Final = SensorView(radians(40.0), 80.0, 15.0)
+CAMERA: Final = SensorView(radians(40.0), 80.0)
 """The camera of the SLAMCU paper, section 6.1."""
-LIDAR: Final = SensorView(_TURN, 50.0, 10.0)
+LIDAR: Final = SensorView(_TURN, 50.0)
 """Poles are found reliably so far around."""
 
 
@@ -109,7 +99,7 @@ class Occlusion:
 
     @classmethod
     def of_look(cls, look: Detections) -> "Occlusion | None":
-        """What a detector says of what is in its way; None where it does not say."""
+        """The free ranges that come with a look; None where it brings none."""
         if not len(look.free_m):
             return None
         return cls.of_ranges(look.free_m, -0.5 * look.free_field_rad, look.free_field_rad / len(look.free_m))

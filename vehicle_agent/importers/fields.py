@@ -13,11 +13,47 @@ from numpy.typing import NDArray
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
 
-RING_FIELDS: Final = ("ring", "channel", "line", "laser_id")
-TIME_FIELDS: Final = ("t_offset", "t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset")
+RING_FIELDS: Final = ("ring", "channel", "line", "laser_id", "laser_number")
+TIME_FIELDS: Final = (
+    "t_offset", "t", "time", "timestamp", "time_stamp", "timeStamp", "offset_time", "timeOffset", "offset_ns",
+    "gps_time",
+)  # fmt: skip
+UNITS_NS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+ABSOLUTE_FROM: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
+"""Times from these on count from 1970; in seconds that is from 1973."""
+SWEEP_S: Final = (0.01, 1.0)
+"""A sweep lasts so long: of the units only one lies within, as they are a thousand apart."""
 LONGEST_SWEEP_NS: Final = 1_000_000_000
 """Times that span more are something else (a counter, a stamp of another clock): the points count as simultaneous."""
 MAX_POINT_BYTES: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class FieldChoice:
+    """Which field is the time of a point, "none" for no field, and its unit; None: found out."""
+
+    time: str | None = None
+    unit: str | None = None
+
+
+ANY_FIELD: Final = FieldChoice()
+
+
+@dataclass(frozen=True, slots=True)
+class TimeRule:
+    """How the times of points are read: their field (None: there is none), ns a count, whether from 1970 on."""
+
+    field: str | None
+    ns: float = 1.0
+    absolute: bool = False
+
+    @property
+    def said(self) -> str:
+        """In words."""
+        if self.field is None:
+            return "no times of points"
+        unit = next((unit for unit, ns in UNITS_NS.items() if ns == self.ns), "?")
+        return f"times of points: {self.field}, {'since 1970' if self.absolute else 'against the stamp'}, in {unit}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,28 +95,71 @@ def _dtype(where: str, fields: Sequence[Field], step: int) -> np.dtype[np.void]:
         raise ImportDriveError(f"{where}: impossible fields: {error}") from error
 
 
-def scan_of_fields(points: NDArray[np.void], t_ns: int) -> RawScan:
-    """A scan of packed points (N,), times after the earliest of its points, ring where the cloud tells."""
+def time_rule(points: NDArray[np.void], choice: FieldChoice = ANY_FIELD) -> TimeRule:
+    """How the times of points (N,) of a sweep are read; from its own values, where the choice leaves it open.
+
+    Drivers count seconds, milliseconds, microseconds or nanoseconds, since 1970 or against the stamp (Velodyne: `time`
+    in s; Ouster: `t` in ns; Hesai and RoboSense: `timestamp` in s since 1970; Livox: `timestamp` in ns since 1970).
+
+    Raises:
+        ImportDriveError: the field that was chosen is not there.
+    """
+    names = points.dtype.names or ()
+    if choice.time == "none":
+        return TimeRule(None)
+    if choice.time is not None and choice.time not in names:
+        raise ImportDriveError(f"--time-field {choice.time}: no such field; fields are {', '.join(names)}")
+    field = choice.time or next((name for name in TIME_FIELDS if name in names), None)
+    if field is None or points[field].ndim > 1:
+        return TimeRule(None)
+    values = points[field].astype(np.float64)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return TimeRule(field, UNITS_NS[choice.unit or "s"])
+    largest, span = float(np.abs(values).max()), float(values.max() - values.min())
+    since_1970 = next((unit for unit, least in ABSOLUTE_FROM.items() if largest >= least), None)
+    if since_1970 is not None and span < 0.5 * largest:
+        unit = choice.unit or since_1970
+        return TimeRule(field, UNITS_NS[unit], absolute=largest >= ABSOLUTE_FROM[unit])
+    fits = [unit for unit, ns in UNITS_NS.items() if SWEEP_S[0] <= span * ns * 1e-9 <= SWEEP_S[1]]
+    usual = "s" if points[field].dtype.kind == "f" else "ns"
+    return TimeRule(field, UNITS_NS[choice.unit or (fits[0] if fits else usual)])
+
+
+def scan_of_fields(points: NDArray[np.void], t_ns: int, rule: TimeRule | None = None) -> RawScan:
+    """A scan of packed points (N,) stamped t_ns: times after the earliest of its points, ring where the cloud tells.
+
+    The sweep begins with its earliest point: before the stamp where the driver stamps the end and counts backwards.
+    """
     names = points.dtype.names or ()
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    time = next((name for name in TIME_FIELDS if name in names), None)
+    rule = time_rule(points) if rule is None else rule
     ring = next((name for name in RING_FIELDS if name in names), None)
-    offset = np.zeros(len(points), np.uint32) if time is None else offsets_ns(points[time])
+    begin_ns, offset = t_ns, np.zeros(len(points), np.uint32)
+    if rule.field is not None and rule.field in names:
+        begin_ns, offset = times_of(points[rule.field], t_ns, rule)
     rings = None if ring is None or points[ring].ndim > 1 else _rings(points[ring])
-    return RawScan(t_ns, np.ascontiguousarray(xyz), offset, rings)
+    return RawScan(begin_ns, np.ascontiguousarray(xyz), offset, rings)
 
 
-def offsets_ns(values: NDArray[np.generic]) -> NDArray[np.uint32]:
-    """(N,) times after the earliest in ns: integers count nanoseconds, floats seconds; zeros where they make no sense.
+def times_of(values: NDArray[np.generic], t_ns: int, rule: TimeRule) -> tuple[int, NDArray[np.uint32]]:
+    """When the earliest point was measured, and (N,) times after it in ns.
 
-    Drivers stamp a cloud at its start or at its end and count from there; only differences within the cloud are used.
+    The stamp where the points count by another clock; zeros where the times make no sense: a sweep of more than
+    `LONGEST_SWEEP_NS`, or values that are no numbers.
     """
     zeros = np.zeros(len(values), np.uint32)
     if values.ndim != 1 or not len(values) or not np.isfinite(values.astype(np.float64)).all():
-        return zeros
-    after = values - values.min()
-    ns = np.round(after.astype(np.float64) * (1e9 if values.dtype.kind == "f" else 1.0))
-    return ns.astype(np.uint32) if ns.max() <= LONGEST_SWEEP_NS else zeros
+        return t_ns, zeros
+    first = values.min()
+    after = np.round((values - first).astype(np.float64) * rule.ns)
+    if after.max() > LONGEST_SWEEP_NS:
+        return t_ns, zeros
+    if rule.absolute:  # as integers: a double holds times since 1970 to 0.2 us, nanoseconds as float not at all
+        begin_ns = int(first) * int(rule.ns) + round((float(first) - int(first)) * rule.ns)
+        return (begin_ns if abs(begin_ns - t_ns) <= LONGEST_SWEEP_NS else t_ns), after.astype(np.uint32)
+    begin_ns = round(float(first) * rule.ns)
+    return t_ns + (begin_ns if abs(begin_ns) <= LONGEST_SWEEP_NS else 0), after.astype(np.uint32)
 
 
 def _rings(values: NDArray[np.generic]) -> NDArray[np.uint16]:

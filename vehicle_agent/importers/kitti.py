@@ -25,6 +25,7 @@ LIDAR_HEIGHT_M = 1.73  # KITTI's sensor setup
 PERIOD_NS = 103_600_000  # where no times are given: the LiDAR turned at 9.65 Hz
 START_NS = 1_317_000_000_000_000_000  # times in the files count from 0: put them in autumn 2011
 SCAN_FOLDERS = ("velodyne", "velodyne_xz", "velodyne_points/data", "velodyne_points_xz", "data", ".")
+TIME_FILES = ("times.txt", "*_times.txt")
 RECORD_BYTES = 16
 
 # Velodyne to camera 0 of 2011_10_03 (sequences 00-02), used where the folder has no calib.txt.
@@ -59,6 +60,8 @@ def open_kitti(folder: Path, anchor: RecordingAnchor | None) -> Recording:
         anchor=place,
         gnss=_fixes(folder, t_ns, T_vehicle_lidar, place),
         stamp="middle",
+        placed=anchor is not None,
+        timed=bool(files_of(folder, *TIME_FILES)),
     )
 
 
@@ -82,7 +85,7 @@ def _scan(path: Path, t_ns: int) -> RawScan:
 
 
 def _times(folder: Path, n: int) -> NDArray[np.int64]:
-    files = files_of(folder, "times.txt", "*_times.txt")
+    files = files_of(folder, *TIME_FILES)
     if not files:
         return START_NS + PERIOD_NS * np.arange(n, dtype=np.int64)
     seconds = np.loadtxt(files[0], ndmin=1)
@@ -101,19 +104,26 @@ def _fixes(folder: Path, t_ns: NDArray[np.int64], T_vehicle_lidar: F64, anchor: 
         raise ImportDriveError(f"{files[0]}: {rows.shape} numbers for {len(t_ns)} scans; 12 a scan are needed")
     T_camera = np.tile(np.eye(4), (len(t_ns), 1, 1))
     T_camera[:, :3] = rows[: len(t_ns)].reshape(-1, 3, 4)
-    T_camera_vehicle = _T_camera_lidar(folder) @ T_inverse(T_vehicle_lidar)
+    calibrated = calibration_of(folder)
+    T_camera_lidar = T_CAMERA_LIDAR_2011_10_03 if calibrated is None else calibrated
+    T_camera_vehicle = T_camera_lidar @ T_inverse(T_vehicle_lidar)
     p_map = (T_inverse(T_camera_vehicle) @ T_inverse(T_camera[0]) @ T_camera @ T_camera_vehicle)[:, :3, 3]
-    lat, lon, height = anchor.frame.geodetic_from_enu(p_map)
+    lat, lon, height = anchor.frame.geodetic_from_enu(p_map @ anchor.T_map_start[:3, :3].T)
     return tuple(
         GnssFix(int(t), float(a), float(o), float(h), GNSS_SIGMA_M)
         for t, a, o, h in zip(t_ns, lat, lon, height, strict=True)
     )
 
 
-def _T_camera_lidar(folder: Path) -> F64:
+def calibration_of(folder: Path) -> F64 | None:
+    """(4, 4) T_camera_lidar of a folder's calib.txt; None where there is none.
+
+    Raises:
+        ImportDriveError: the file lacks it.
+    """
     path = folder / "calib.txt"
     if not path.exists():
-        return T_CAMERA_LIDAR_2011_10_03
+        return None
     for line in path.read_text().splitlines():
         if line.startswith("Tr:"):
             return np.vstack([np.array(line.split()[1:], np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])

@@ -105,6 +105,12 @@ def _ground(recording: Recording, course_rad: float | None) -> GroundSeen | Moun
     return ground_of_scans(seen, CROWN_RAD if course_rad is None else FLOOR_RAD)
 
 
+def ground_seen(recording: Recording) -> GroundSeen | None:
+    """The ground as the LiDAR sees it in the vehicle's axes, its height below the LiDAR; None where it is not seen."""
+    ground = _ground(recording, None)
+    return ground if isinstance(ground, GroundSeen) else None
+
+
 def _lidar_poses(track: Trajectory, T_vehicle_lidar: F64) -> F64:
     """(N, 4, 4) where the LiDAR was, in the vehicle's axes."""
     lever = np.eye(4)

@@ -3,10 +3,11 @@
 Poses come from `poses.txt` (in the folder or the one above), one line a scan in the order of the files' numbers:
 `number t x y z qx qy qz qw`, `t x y z qx qy qz qw` (TUM) or twelve numbers of a 3 x 4 matrix (KITTI; 10 Hz then). They
 are poses of the LiDAR, x forward, in axes east, north, up; the place of the first one must be given. Without poses
-LiDAR odometry tells the track, heading east. Files give neither times of points nor the mount; a scan's time is taken
-as the beginning of its sweep.
+LiDAR odometry finds the track. A field with the times of points is read where there is one, file names that are stamps
+give the times of scans; a scan's time is taken as the beginning of its sweep. The mount is not known.
 """
 
+import contextlib
 import re
 from pathlib import Path
 
@@ -16,10 +17,14 @@ from numpy.typing import NDArray
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
 from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.fields import ANY_FIELD, FieldChoice, TimeRule, scan_of_fields, time_rule
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of
 from gnd.vehicle_agent.importers.pcd_format import read_pcd
-from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.rigid import orthonormal
+from gnd.vehicle_agent.importers.stamps import stamps_of_names
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -29,27 +34,29 @@ START_NS = 1_000_000_000_000_000_000  # where no times are given
 SCAN_FOLDERS = (".", "pcds", "pcd", "scans", "velodyne")
 
 
-def open_pcd(folder: Path, anchor: RecordingAnchor | None) -> Recording:
+def open_pcd(folder: Path, anchor: RecordingAnchor | None, choices: Choices | None = None) -> Recording:
     """A folder of PCD files; `anchor` says where on the Earth the first pose lies.
 
     Raises:
-        ImportDriveError: no scans, no anchor, poses that do not fit the scans.
+        ImportDriveError: no scans, poses that do not fit the scans.
     """
     check_folder(folder)
     files = _scan_files(folder)
-    if anchor is None:
-        raise ImportDriveError(f"{folder}: PCD files do not say where they were taken; give --anchor LAT,LON,HEIGHT")
-    t_ns, track = _track(files[0].parent, len(files))
+    t_ns, track = _track(files[0].parent, files)
+    rule, fields = _time_rule(files, choices.fields if choices else ANY_FIELD)
     return Recording(
         name=folder.name,
         sensor_model="unknown",
         source=f"PCD files of {folder.name}; motion from the track",
         T_vehicle_lidar=np.eye(4),
         t_ns=t_ns,
-        read=lambda i: read_scan(files[i], int(t_ns[i])),
-        anchor=anchor,
+        read=lambda i: scan_of_fields(_points(files[i]), int(t_ns[i]), rule),
+        anchor=anchor or NOMINAL,
         track=track,
         mount="assumed",
+        placed=anchor is not None,
+        timed=track is not None or int(t_ns[0]) != START_NS,
+        entries=(Entry(files[0].parent.name, "PCD files", len(files), f"{', '.join(fields)}; {rule.said}", "scans"),),
     )
 
 
@@ -70,19 +77,35 @@ def scan_number(path: Path) -> tuple[int, str]:
 
 def read_scan(path: Path, t_ns: int) -> RawScan:
     """The points of one file, all at the time of the sweep."""
-    points = read_pcd(path)
-    missing = {"x", "y", "z"} - set(points.dtype.names or ())
-    if missing:
-        raise ImportDriveError(f"{path}: no field {', '.join(sorted(missing))}")
+    points = _points(path)
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32)
     return RawScan(t_ns, xyz, np.zeros(len(xyz), np.uint32))
 
 
-def _track(folder: Path, n: int) -> tuple[I64, Trajectory | None]:
+def _points(path: Path) -> NDArray[np.void]:
+    points = read_pcd(path)
+    missing = {"x", "y", "z"} - set(points.dtype.names or ())
+    if missing:
+        raise ImportDriveError(f"{path}: no field {', '.join(sorted(missing))}")
+    return points
+
+
+def _time_rule(files: list[Path], choice: FieldChoice) -> tuple[TimeRule, tuple[str, ...]]:
+    """How the times of points are read and which fields there are, from the first file that can be read."""
+    for path in files[:5]:
+        with contextlib.suppress(ImportDriveError):
+            points = _points(path)
+            return time_rule(points, choice), points.dtype.names or ()
+    return TimeRule(None), ()
+
+
+def _track(folder: Path, scans: list[Path]) -> tuple[I64, Trajectory | None]:
     """Scan times and poses, the first pose's position taken as origin."""
     files = files_of(folder, "poses.txt") or files_of(folder.parent, "poses.txt")
+    n = len(scans)
     if not files:
-        return START_NS + PERIOD_NS * np.arange(n, dtype=np.int64), None
+        named = stamps_of_names(scans)
+        return (START_NS + PERIOD_NS * np.arange(n, dtype=np.int64) if named is None else named), None
     rows = table_of(files[0])
     if len(rows) != n or rows.shape[1] not in (8, 9, 12):
         raise ImportDriveError(
@@ -91,6 +114,8 @@ def _track(folder: Path, n: int) -> tuple[I64, Trajectory | None]:
         )
     t_ns, T = _poses(rows)
     T[:, :3, 3] -= T[0, :3, 3]
+    if rows.shape[1] == 12 and (named := stamps_of_names(scans)) is not None:
+        t_ns = named
     return t_ns, Trajectory(t_ns, T)
 
 
@@ -104,8 +129,7 @@ def table_of(path: Path) -> F64:
 
 def _poses(rows: F64) -> tuple[I64, F64]:
     if rows.shape[1] == 12:
-        T = np.tile(np.eye(4), (len(rows), 1, 1))
-        T[:, :3] = rows.reshape(-1, 3, 4)
+        T, _ = orthonormal(rows.reshape(-1, 3, 4), "poses.txt")
         return START_NS + PERIOD_NS * np.arange(len(rows), dtype=np.int64), T
     t_s, position, quaternion = rows[:, -8], rows[:, -7:-4], rows[:, -4:]
     return np.round(t_s * 1e9).astype(np.int64), T_from_R_t(R_from_quaternion_xyzw(quaternion), position)

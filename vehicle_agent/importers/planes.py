@@ -64,6 +64,8 @@ def open_planes(folder: Path, anchor: RecordingAnchor | None) -> Recording:
         gnss=_fixes(ins_ns, ins),
         motion=_motion(ins_ns, ins),
         stamp="middle",
+        timed=bool(len(ins["lat_deg"])),
+        placed=anchor is not None or bool(len(ins["lat_deg"])),
         mount="given" if kitti else "assumed",
         notes=(f"stamps lie up to {rounded * 1e-6:.1f} ms off an even rhythm: scans take the rhythm",)
         if rounded

@@ -59,10 +59,10 @@ class _Cdr:
         return self._body[start : self._at]
 
 
-def stamp_ns(where: str, data: bytes) -> int:
-    """Only the time of the header."""
+def head_of(where: str, data: bytes) -> tuple[int, str]:
+    """Only the header: time and frame."""
     cdr = _Cdr(where, data)
-    return cdr.number("i") * 1_000_000_000 + cdr.number("I")
+    return cdr.number("i") * 1_000_000_000 + cdr.number("I"), cdr.text()
 
 
 def decode_cloud(where: str, data: bytes) -> DecodedCloud:

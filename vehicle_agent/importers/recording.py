@@ -13,6 +13,7 @@ from gnd.gnd_map.se3 import exp_so3
 from gnd.schemas.drive import Deskew, GnssFix, MotionSample, MountSigma, MountSource, Scan
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.trajectories.pose_table import PoseTable
 
 F64 = NDArray[np.float64]
 
@@ -21,11 +22,23 @@ GNSS_SIGMA_M = 2.5
 
 @dataclass(frozen=True, slots=True)
 class RecordingAnchor:
-    """Where on the Earth the first pose of a recording is put."""
+    """Where on the Earth the first pose of a recording (or the origin of its poses' local frame) is put.
+
+    heading_deg: compass heading of the vehicle there (or of the local frame's x axis), clockwise from north; None: not
+    given, and east is taken where nothing else tells.
+    """
 
     lat_deg: float
     lon_deg: float
     height_m: float
+    heading_deg: float | None = None
+
+    @property
+    def T_map_start(self) -> F64:
+        """(4, 4) turn about the vertical by the heading; the identity looks east."""
+        T = np.eye(4)
+        T[:3, :3] = exp_so3([0.0, 0.0, np.radians(90.0 - (90.0 if self.heading_deg is None else self.heading_deg))])
+        return T
 
     @property
     def frame(self) -> LocalFrame:
@@ -34,7 +47,22 @@ class RecordingAnchor:
 
 
 NOMINAL = RecordingAnchor(49.0, 8.4, 160.0)
-"""For recordings that do not say where they were taken: Karlsruhe, about the city's ellipsoidal height."""
+"""Stands for no place, where a recording and whoever imports it do not say where it was taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Something that a recording holds: a topic, a kind of file, a trajectory.
+
+    detail: frame, fields, units. used: what for; empty where it is not. why: the reason it is not used, or what to do.
+    """
+
+    name: str
+    kind: str
+    count: int
+    detail: str = ""
+    used: str = ""
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +77,12 @@ class Recording:
     deskew: what the recording says of the times of points; "none" lets the import find out. stamp: what `t_ns` means
     while the times of points are not known. sweep_ns: length of a sweep; 0: the time between scans. mount: whether the
     recording gives `T_vehicle_lidar`; "assumed" lets the import estimate it.
+
+    placed: whether the recording or whoever imports it says where on the Earth it was taken; else `anchor` stands for
+    no place. lever_m: of the GNSS antenna in the vehicle frame. posed: share of the
+    scans as recorded that have a pose. timed: whether the
+    recording itself tells when the scans were taken. poses_on: poses on a topic
+    of it. entries: what the recording holds.
     """
 
     name: str
@@ -67,6 +101,12 @@ class Recording:
     sweep_ns: int = 0
     mount: MountSource = "given"
     mount_sigma: MountSigma | None = None
+    placed: bool = True
+    lever_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    posed: float = 1.0
+    timed: bool = True
+    poses_on: Callable[[str], PoseTable] | None = None
+    entries: tuple[Entry, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.t_ns) < 2:

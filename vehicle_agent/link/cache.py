@@ -53,7 +53,7 @@ class TileCache(Generic[TileT]):
         self.layer = layer
         self.kind = cast("type[TileT]", kind_of_layer(layer))
         self.refused = 0
-        self._db = Database(path, SCHEMA, synchronous="NORMAL", error=CacheError)
+        self._db = Database(path, SCHEMA, synchronous="normal", error=CacheError)
         if not self._db.run(HAS_DAYS):
             self._db.run(ADD_DAYS)
 
@@ -92,10 +92,10 @@ class TileCache(Generic[TileT]):
         row = (*self._of(blob.tile), blob.version, blob.sha, blob.codec_id, blob.body, blob.day, over)
         return self._db.changes(KEEP, row) > 0
 
-    def put(self, tile: TileT, over: bytes = b"") -> bool:
-        """As `keep`, for a tile made here; its body is as small as the tile allows."""
-        blob = TileBlob(tile.tile_id, tile.version, tile.sha, *encode_content(tile), day_of_tile(tile))
-        return self.keep(blob, over)
+    def put(self, tile: TileT, over: bytes = b"", blob: TileBlob | None = None) -> bool:
+        """As `keep`, for a tile that is at hand; without `blob` its body is made as small as the tile allows."""
+        made = blob or TileBlob(tile.tile_id, tile.version, tile.sha, *encode_content(tile), day_of_tile(tile))
+        return self.keep(made, over)
 
     def drop(self, tile_id: TileId) -> None:
         """Forget a tile; not here: nothing happens."""

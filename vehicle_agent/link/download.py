@@ -13,16 +13,14 @@ from gnd.fleet_bus.errors import BusClosed
 from gnd.fleet_bus.links import LinkProfile
 from gnd.gnd_map.content import TileT
 from gnd.gnd_map.tile_id import TileId
+from gnd.tile_client.exchange import Exchange, ExchangeOutcome, Fetched
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import CacheError
 from gnd.vehicle_agent.link.cache import TileCache
-from gnd.vehicle_agent.link.exchange import Exchange, ExchangeOutcome, Fetched
 from gnd.vehicle_agent.link.plan import batch_bytes
 
 DOWNLOAD_BATCH_S: Final = 0.25
 """One answer holds what the link carries in this time (4 to 128 kB): something more urgent waits no longer."""
-
-__all__ = ["Fetched", "TileFetcher"]
 
 POLL_S = 0.25
 OFFLINE_WAIT_S = 0.5
@@ -48,7 +46,8 @@ class TileFetcher(Generic[TileT]):
         self.link: LinkProfile = bus.config.link_profile
         self._bus, self._cache, self._parameters = bus, cache, parameters
         self._offline = False
-        self._exchange = Exchange(bus, cache, parameters.request_s)
+        # One attempt may take all the time there is: a second one would fetch a slow answer twice.
+        self._exchange: Exchange[TileT] = Exchange(bus, cache, parameters.request_s, parameters.request_s)
         rate_byte_s = self.link.rate_byte_s("down")
         self._batch_bytes = batch_bytes(rate_byte_s, DOWNLOAD_BATCH_S)
         # More on its way than the router keeps for us would be thrown away.
@@ -202,7 +201,7 @@ class TileFetcher(Generic[TileT]):
         try:
             if not self._has_router():
                 return ExchangeOutcome[TileT]()
-            return self._exchange.ask(batch, whole, self._batch_bytes)
+            return self._exchange.ask(batch, whole, self._batch_bytes, near=batch[0])
         except BusClosed:
             return ExchangeOutcome[TileT]()
         except Exception as error:  # whatever it was: a worker that ends would never fetch again

@@ -18,11 +18,11 @@ from gnd.fleet_bus.bus import Bus
 from gnd.gnd_map.features import FeatureTile, is_feature_layer
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.wire import LAYER_PATTERN
+from gnd.tile_client.exchange import Fetched
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import AgentConfigError, CacheError
 from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.link.download import TileFetcher
-from gnd.vehicle_agent.link.exchange import Fetched
 from gnd.vehicle_agent.link.updates import Updates
 
 MOST_IN_FLIGHT: Final = 2

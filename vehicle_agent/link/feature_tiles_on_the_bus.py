@@ -21,13 +21,29 @@ BESIDE_M: Final = 100.0
 STEP_M: Final = 100.0
 
 
+class FeatureTilesAhead:
+    """Which feature tiles a vehicle needs, told anew after some way, and when its heading becomes known."""
+
+    def __init__(self) -> None:
+        self._asked_at_m: float | None = None
+        self._had_heading = False
+
+    def of(self, place: Place) -> tuple[TileId, ...]:
+        """The tiles around and ahead; empty where the last ones still do."""
+        knows_heading = place.course.heading_rad is not None
+        moved_m = None if self._asked_at_m is None else place.odometer_m - self._asked_at_m
+        if moved_m is not None and moved_m < STEP_M and knows_heading <= self._had_heading:
+            return ()
+        self._asked_at_m, self._had_heading = place.odometer_m, knows_heading
+        return tiles_along(place.frame, place.ahead_map_m(AHEAD_M), BESIDE_M)
+
+
 class FeatureTilesOnTheBus:
     """Downloads the tiles of feature layers along one drive; the agent's main thread owns it."""
 
     def __init__(self, downloader: FeatureDownloader, config: AgentConfig, stop: threading.Event) -> None:
         self._downloader, self._config, self._stop = downloader, config, stop
-        self._asked_at_m: float | None = None
-        self._had_heading = False
+        self._ahead = FeatureTilesAhead()
         self._given_up: set[TileId] = set()
 
     @property
@@ -37,11 +53,8 @@ class FeatureTilesOnTheBus:
 
     def follow(self, place: Place) -> Iterator[tuple[str, FeatureTile]]:
         """Ask for the tiles around and ahead now and then; gives those of which a new version has come."""
-        knows_heading = place.course.heading_rad is not None
-        moved_m = None if self._asked_at_m is None else place.odometer_m - self._asked_at_m
-        if moved_m is None or moved_m >= STEP_M or knows_heading > self._had_heading:
-            self._asked_at_m, self._had_heading = place.odometer_m, knows_heading
-            self._ask(tiles_along(place.frame, place.ahead_map_m(AHEAD_M), BESIDE_M))
+        if wanted := self._ahead.of(place):
+            self._ask(wanted)
         for layer, tiles in self._downloader.step().items():
             for tile_id in sorted(tiles):
                 tile = self._downloader.tile(layer, tile_id)

@@ -124,7 +124,7 @@ class Outbox:
     """Reports in SQLite (WAL, synchronous FULL: `put` returns when the report survives a power cut)."""
 
     def __init__(self, path: Path) -> None:
-        self._db = Database(path, SCHEMA, synchronous="FULL", error=OutboxError)
+        self._db = Database(path, SCHEMA, synchronous="full", error=OutboxError)
         with self._db.transaction() as c:
             if "wanted" not in {row[0] for row in c.execute("SELECT name FROM pragma_table_info('report')")}:
                 for step in _MIGRATION:

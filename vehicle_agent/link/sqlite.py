@@ -1,50 +1,41 @@
-"""One SQLite file of the vehicle: opened with checked settings, guarded by one lock."""
+"""One SQLite file of the vehicle: opened as the store's, guarded by one lock."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import apsw
 
+from gnd.tile_store.sqlite_connection import log_ahead
 from gnd.vehicle_agent.errors import VehicleError
+
+BUSY_TIMEOUT_S: Final = 5.0
 
 
 class Database:
-    """A connection behind a lock; each `run` or `run_many` is one transaction."""
+    """A connection behind a lock; each call is one transaction.
+
+    Args:
+        path: of the file; its folder is made.
+        schema: SQL that may be run again.
+        synchronous: "full": every commit survives a power cut; "normal": a crash of the process only.
+        error: raised where SQLite or the disk fails.
+    """
 
     def __init__(
-        self, path: Path, schema: str, *, synchronous: Literal["FULL", "NORMAL"], error: type[VehicleError]
+        self, path: Path, schema: str, *, synchronous: Literal["full", "normal"], error: type[VehicleError]
     ) -> None:
-        self._error = error
+        self._error, self._path = error, path
         self._lock = Lock()
-        self._what = str(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._connection = apsw.Connection(str(path))
-            self._connection.set_busy_timeout(5000)
-            self._connection.execute(f"PRAGMA journal_mode = WAL; PRAGMA synchronous = {synchronous}")
+            log_ahead(self._connection, synchronous, BUSY_TIMEOUT_S)
             self._connection.execute(schema)
         except (apsw.Error, OSError) as cause:
             raise error(f"cannot open {path}: {cause}. Give a folder that may be written.") from cause
-
-    def run(self, sql: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """Execute one statement and return its rows."""
-        try:
-            with self._lock, self._connection:
-                rows = list(self._connection.execute(sql, values))
-        except (apsw.Error, OSError) as cause:
-            raise self._error(f"{self._what}: {cause}") from cause
-        return rows
-
-    def run_many(self, sql: str, rows: Iterable[Sequence[Any]]) -> None:
-        """Execute one statement for each row, in one transaction."""
-        try:
-            with self._lock, self._connection:
-                self._connection.executemany(sql, rows)
-        except (apsw.Error, OSError) as cause:
-            raise self._error(f"{self._what}: {cause}") from cause
 
     @contextmanager
     def transaction(self) -> Iterator[apsw.Connection]:
@@ -53,17 +44,23 @@ class Database:
             with self._lock, self._connection as connection:
                 yield connection
         except (apsw.Error, OSError) as cause:
-            raise self._error(f"{self._what}: {cause}") from cause
+            raise self._error(f"{self._path}: {cause}") from cause
+
+    def run(self, sql: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """Execute one statement and return its rows."""
+        with self.transaction() as connection:
+            return list(connection.execute(sql, values))
+
+    def run_many(self, sql: str, rows: Iterable[Sequence[Any]]) -> None:
+        """Execute one statement for each row, in one transaction."""
+        with self.transaction() as connection:
+            connection.executemany(sql, rows)
 
     def changes(self, sql: str, values: Sequence[Any] = ()) -> int:
         """Execute one statement and return how many rows it changed."""
-        try:
-            with self._lock, self._connection:
-                self._connection.execute(sql, values)
-                changed = self._connection.changes()
-        except (apsw.Error, OSError) as cause:
-            raise self._error(f"{self._what}: {cause}") from cause
-        return changed
+        with self.transaction() as connection:
+            connection.execute(sql, values)
+            return connection.changes()
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

@@ -19,10 +19,13 @@ class TilesOnTheBus:
     ) -> None:
         self._surroundings = Surroundings(local_map, link.fetcher, touched, config.download)
         self._stop, self._waits = stop, config.waits_for_tiles
+        self._waits_first = bool(config.live.source)
+        """A vehicle that starts now stands: its first sweeps wait for the tiles around it, or for its cache."""
         self.updates: Updates[Tile] = Updates(link.bus, link.cache, link.fetcher, self._surroundings.replace)
 
     def follow(self, place: Place) -> None:
         """Apply what others changed, and hold the tiles around and ahead."""
         self.updates.apply()
         self.updates.follow(self._surroundings.look_ahead(place))  # before asking: nothing is missed in between
-        self._surroundings.follow(place, self._stop, wait=self._waits)
+        self._surroundings.follow(place, self._stop, wait=self._waits or self._waits_first)
+        self._waits_first = False

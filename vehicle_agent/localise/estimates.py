@@ -15,7 +15,7 @@ Health = Literal["good", "degraded", "lost"]
 Cause = Literal[
     "none", "wrong_pose", "stale_map", "poor_place", "no_map", "no_match", "no_position", "no_motion", "bad_scan",
     "bad_time", "gap", "ambiguous", "searching", "unconfirmed",
-    "clock", "mount", "disputed",
+    "clock", "mount", "disputed", "hindsight",
 ]  # fmt: skip
 
 

@@ -37,7 +37,7 @@ _SEEN_SHARE: Final = 0.3
 """Of a place where A knows fewer of them nothing can be said."""
 _BLOCK_M: Final = 15.0
 _BLOCK_PAIRS: Final = 50
-_FIRM_SHARE: Final = 0.97
+_FIRM_SHARE: Final = 0.85
 _BETTER: Final = 1.5
 """A block lies better elsewhere when the surfaces that can tell are worth so much more there: 9 cm make 1.5."""
 _MOST: Final = 0.6
@@ -52,8 +52,8 @@ MIN_LEVEL_SHARE: Final = 0.5
 MAX_SECOND: Final = 0.85
 """The second place may be worth so much of the best."""
 MAX_BEND_M: Final = 0.12
-"""Residual shift of blocks that may not be exceeded by more than 15 % of the surfaces: what was rebuilt a little beside its
-old place looks the same."""
+"""Residual shift of blocks that at most 15 % of the surfaces may exceed: what was rebuilt a little beside its old place
+looks the same."""
 MAX_TILT_RAD: Final = float(np.radians(2.0))
 
 

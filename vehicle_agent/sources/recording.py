@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator
 from itertools import chain
 
@@ -9,20 +10,25 @@ from gnd.schemas.drive import DriveItem, GnssFix
 from gnd.vehicle_agent.errors import VehicleError
 
 
-def first_fix(items: Iterable[DriveItem], name: object) -> tuple[GnssFix, Iterator[DriveItem]]:
+def first_fix(
+    items: Iterable[DriveItem], name: object, *, most_ns: int | None = None
+) -> tuple[GnssFix, Iterator[DriveItem]]:
     """Return the first position of a drive, where the map frame is laid, and all its items again.
 
     Args:
         items: in time order.
         name: of the drive, for the message.
+        most_ns: items that are older than the first position by more are left out; None: all are kept.
 
     Raises:
         VehicleError: there is none.
     """
-    before: list[DriveItem] = []
+    before: deque[DriveItem] = deque()
     coming = iter(items)
     for item in coming:
         before.append(item)
+        while most_ns is not None and item.t_ns - before[0].t_ns > most_ns:
+            before.popleft()
         if isinstance(item, GnssFix):
             return item, chain(before, coming)
     raise VehicleError(f"{name} has no GNSS fix: the vehicle would not know which tiles to ask for")

@@ -1,10 +1,7 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
-from study_rows import no_pose, result, sensor
 
-from studies.localisation_study.figures import NEAR_M, broken, draw_overview, share_near
+from studies.localisation_study.figures import NEAR_M, broken, share_near
 
 
 def test_the_share_of_what_is_near() -> None:
@@ -19,11 +16,3 @@ def test_lines_are_broken_where_poses_are_missing() -> None:
     found_s, error = broken(t_s, np.arange(7.0))
     assert np.isnan(found_s).tolist() == np.isnan(error).tolist() == [False] * 4 + [True] + [False] * 3
     assert found_s[~np.isnan(found_s)] == pytest.approx(t_s)
-
-
-def test_the_overview_copes_with_sensors_without_poses_or_variants(tmp_path: Path) -> None:
-    lost = {name: no_pose() for name in ("with_submap", "after_update", "fresh")}
-    scala = sensor(**lost)
-    del scala["variants"]
-    path = draw_overview(result(vlp16=sensor(), scala=scala), tmp_path / "overview.png")
-    assert path.read_bytes().startswith(b"\x89PNG")

@@ -7,7 +7,6 @@ from studies.frame.averages import worst_of
 from studies.frame.tables import markdown_of
 from studies.localisation_study import series as reference
 from studies.localisation_study.summary import ROWS, SMALLEST_IS_WORST, sheets_of, targets_of, within
-from studies.localisation_study.variants import VARIANTS
 
 
 def test_the_papers_numbers() -> None:
@@ -78,7 +77,7 @@ def test_of_several_seeds_the_worst_counts() -> None:
 
 def test_tables_show_every_row_and_the_papers() -> None:
     rows = sheets_of(result(vlp16=sensor()))[1].rows
-    assert len([cells for cells, style in rows if not style]) == len(ROWS) + len(VARIANTS)
+    assert len([cells for cells, style in rows if not style]) == len(ROWS)
     assert len([cells for cells, style in rows if style == "dim"]) == len(reference.PAPER)
     without = rows[1][0]
     assert without[:4] == (

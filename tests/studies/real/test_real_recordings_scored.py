@@ -20,7 +20,7 @@ def test_recordings_of_real_sensors(
     if not (shared_data / folder).is_dir():
         pytest.skip(f"{folder} is not there")
     options = RealOptions(shared_data / folder, rounds=1, objects=8, at_most=at_most)
-    found = reproduce_real(options, None, no_progress)
+    found = reproduce_real(options, no_progress)
     inserted, untouched = found["inserted"], found["untouched"]
     assert inserted["new"]["true"] >= 5
     assert inserted["deleted"]["true"] >= 5

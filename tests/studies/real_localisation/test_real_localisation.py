@@ -90,7 +90,7 @@ def test_a_slam_track_and_its_lanes_on_the_earth(shared_data: Path) -> None:
 
 @pytest.fixture(scope="module")
 def nagoya(shared_data: Path) -> dict[str, dict[str, Any]]:
-    found, _ = nagoya_of(shared_data / "gnss_nagoya")
+    found = nagoya_of(shared_data / "gnss_nagoya")
     return {row["name"]: row for row in found["by"]}
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from gnd.fleet_sim.drives import DriveSimulation, simulate_drive
 from gnd.fleet_sim.street import StreetOptions
-from gnd.fleet_sim.truth import read_truth
 from gnd.fleet_sim.world import read_world
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
@@ -19,7 +18,6 @@ from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.local_map import LocalMap
 from studies.frame.folder import StudyFolder
 from studies.simulation.base_map import read_base
-from studies.simulation.masses import WATCHED, choose, most_telling
 from studies.simulation.options import MethodParameters, PoseSource, RunOptions
 from studies.simulation.poses import TIME_CONSTANT_S, FromReference
 from studies.simulation.result import VehicleResult, VoxelRows
@@ -74,28 +72,6 @@ def test_parameters_reach_the_detector(world: tuple[WorldFiles, VehicleTask]) ->
     strict = MethodParameters().with_changes(["detect.new_cells=200"])
     new = [simulated(replace(world[1], method=m)).stats["classes"]["new"] for m in (MethodParameters(), strict)]
     assert new[1] < new[0] / 2
-
-
-def test_watched_masses_add_up_to_the_evidence(world: tuple[WorldFiles, VehicleTask]) -> None:
-    files, task = world
-    truth = read_truth(files.truth)
-    watch = choose(truth)
-    assert watch is not None
-    assert set(watch.change_class) == {int(c) for c in WATCHED}
-    result = simulated(replace(task, watch=watch))
-    t_ns, counters = result.watched
-    assert (np.diff(t_ns) > 0).all()
-    assert (np.diff(counters, axis=0) >= 0).all()
-    rows = np.searchsorted(truth.morton, watch.tile.morton) + np.searchsorted(
-        truth.voxel_id[truth.morton == watch.tile.morton], watch.voxel_id
-    )
-    assert truth.voxel_id[rows].tolist() == list(watch.voxel_id)
-    at = np.searchsorted(result.row, rows)
-    known = (at < len(result.row)) & (result.row[np.minimum(at, len(result.row) - 1)] == rows)
-    assert known.any()
-    columns = np.stack([result.evidence[name] for name in ("n_bi", "n_bo", "n_be", "n_pi")], axis=1)
-    assert np.array_equal(counters[-1][known], columns[at[known]])
-    assert any(index >= 0 for index in most_telling(watch, counters))
 
 
 def still(n: int) -> tuple[DriveHeader, LocalMap, list[ReferencePose | Scan]]:

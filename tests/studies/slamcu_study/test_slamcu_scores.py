@@ -16,7 +16,6 @@ from studies.slamcu_study.scores import (
     drive_summary,
     lost_without_knowing,
     merged_score,
-    parts_of_errors,
     score,
     scored_drive,
     worst_of,
@@ -48,22 +47,16 @@ def verdicts(**changes: object) -> Verdicts:
     columns: dict[str, object] = {
         "known_id": np.array([1, 2, 3, 4]),
         "known_predicted": np.array([NORMAL, DELETED, DELETED, UNCLASSIFIED], np.uint8),
-        "known_conflict": np.array([0.1, 0.9, 0.9, 0.0]),
-        "new_xy_m": np.array([[40.3, 0.4], [41.0, 0.1], [10.5, 0.0], [90.0, 1.0]]),
-        "new_cov_m2": np.broadcast_to(0.04 * np.eye(2), (4, 2, 2)),
-        "new_exists": np.array([True, True, True, False]),
-        "new_conflict": np.zeros(4),
+        "new_xy_m": np.array([[40.3, 0.4], [41.0, 0.1], [10.5, 0.0]]),
+        "new_cov_m2": np.broadcast_to(0.04 * np.eye(2), (3, 2, 2)),
         "step_ms": np.array([1.0, 2.0, 9.0]),
         "pose_error": STEPS,
         "pose_chi2": np.array([1.0, 2.0, 3.0]),
-        "pose_said_lost": np.zeros(3, np.bool_),
+        "pose_given_up": np.zeros(3, np.bool_),
         "lost": np.array([[10.0, 40.0, 7.5, 5.6, 3.0, 1.0]]),
-        "pose_part_m": np.vstack([np.full((4, 2), np.nan), [[0.3, 0.0], [0.0, 0.0], [np.nan, np.nan]]]),
         "visible": np.array([9, 9, 9, 0, 9, 9, 0]),
         "occluded": np.array([1, 0, 0, 4, 0, 0, 2]),
-        "no_evidence": 5,
         "trace_sign": np.array([2, 2, 2, 2, 4, 4]),
-        "trace_s": np.arange(6.0),
         "trace_masses": np.array([[.95, 0, .05], [.6, .37, .03], [.9, .08, .02], GONE, [0, 0, 1], EXISTS]),
     }  # fmt: skip
     return Verdicts(**{**columns, **changes})  # type: ignore[arg-type]
@@ -82,8 +75,8 @@ def test_every_sign_of_the_route_is_in_the_table() -> None:
     )
 
 
-def test_a_new_feature_that_does_not_exist_is_not_found() -> None:
-    summary = drive_summary(verdicts(new_exists=np.zeros(4, np.bool_)), TRUTH)
+def test_new_signs_that_no_report_mentions_are_missed() -> None:
+    summary = drive_summary(verdicts(new_xy_m=np.zeros((0, 2)), new_cov_m2=np.zeros((0, 2, 2))), TRUTH)
     assert summary["confusion"][NEW] == [0, 0, 0, 3]
     assert summary["position_error_m"]["missed"] == 3
     assert summary["position_error_m"]["mean"] is None
@@ -93,12 +86,6 @@ def test_a_new_feature_that_does_not_exist_is_not_found() -> None:
 def test_signs_that_the_drive_does_not_mention_are_unclassified() -> None:
     silent = verdicts(known_id=np.zeros(0, np.int64), known_predicted=np.zeros(0, np.uint8))
     assert scored_drive(silent, TRUTH).confusion[:2].tolist() == [[0, 0, 0, 2], [0, 0, 0, 2]]
-
-
-def test_the_error_is_split_into_the_poses_part_and_the_rest() -> None:
-    found = verdicts()
-    parts = parts_of_errors(scored_drive(found, TRUTH), found)
-    assert parts == pytest.approx({"pose_part": 0.15, "measurement_part": 0.25})
 
 
 def test_signs_that_were_hidden_all_the_time_are_left_out_of_the_visible_ones_only() -> None:
@@ -113,7 +100,7 @@ def test_signs_that_were_hidden_all_the_time_are_left_out_of_the_visible_ones_on
 def test_summary_of_a_drive_counts_looks_and_poses() -> None:
     summary = drive_summary(verdicts(), TRUTH)
     assert summary["looks"] == {
-        "visible": 45, "occluded": 7, "no_evidence": 5, "signs_never_visible": 2, "new_signs_never_visible": 1,
+        "visible": 45, "occluded": 7, "signs_never_visible": 2, "new_signs_never_visible": 1,
     }  # fmt: skip
     assert summary["pose_rmse"] == pytest.approx(
         {"longitudinal_m": 1.0, "lateral_m": 0.5, "heading_deg": np.degrees(0.01)}
@@ -168,7 +155,7 @@ def off_by(metres: float, looks: int, chi2: float, **changes: object) -> Verdict
     error = np.zeros((400, 3))
     error[50 : 50 + looks, 0] = metres
     squared = np.where(error[:, 0] > 0.0, chi2, 1.0)
-    columns = {"pose_error": error, "pose_chi2": squared, "pose_said_lost": np.zeros(400, np.bool_)}
+    columns = {"pose_error": error, "pose_chi2": squared, "pose_given_up": np.zeros(400, np.bool_)}
     return verdicts(**{**columns, **changes})
 
 
@@ -179,7 +166,7 @@ def test_lost_without_knowing_is_far_off_for_long_and_beyond_what_is_claimed() -
     assert lost_without_knowing(off_by(20.0, 200, 9.0)) == 0  # it says that it does not know
     given_up = np.zeros(400, np.bool_)
     given_up[40:260] = True
-    assert lost_without_knowing(off_by(20.0, 200, 99.0, pose_said_lost=given_up)) == 0
+    assert lost_without_knowing(off_by(20.0, 200, 99.0, pose_given_up=given_up)) == 0
 
 
 def test_the_worst_drive_and_the_lost_ones_are_told() -> None:

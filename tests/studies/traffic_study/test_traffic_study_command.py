@@ -85,7 +85,7 @@ def test_the_second_start_drives_no_more_and_shows_the_same(
     again = json.loads((tmp_path / "out.json").read_text())
     same = set(again) - {"codec", "targets", "runtime_s"}  # which hold times
     assert {name: again[name] for name in same} == {name: finished[1][name] for name in same}
-    for name in ("download.png", "upload_single.png", "upload_fleet.png"):
+    for name in ("download.png", "upload_fleet.png"):
         assert (finished[0] / name).read_bytes().startswith(b"\x89PNG")
 
 

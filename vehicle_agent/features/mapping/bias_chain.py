@@ -1,8 +1,8 @@
-"""The slow error of a low-cost GNSS receiver as a chain in the graph: first-order Gauss-Markov, said exactly.
+"""The slow error of a low-cost GNSS receiver as a chain in the graph: first-order Gauss-Markov, exactly.
 
 With phi_k = exp(-dt_k / tau) and q_k = sigma² (1 - phi_k²) the process b_k+1 = phi_k b_k + w, w ~ N(0, q_k), is the
 same Gaussian as springs between neighbours of weight phi_k / q_k together with springs to zero: of weight
-(1 - phi) / q at the ends and, with equal steps, (1 - phi)² / q in between. Hence built-in factors say it, and its
+(1 - phi) / q at the ends and, with equal steps, (1 - phi)² / q in between. Hence built-in factors do, and its
 precision has the diagonal (1 + phi²) / q and -phi / q beside it.
 """
 

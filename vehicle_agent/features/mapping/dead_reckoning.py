@@ -10,9 +10,11 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import MotionTrack
-from gnd.vehicle_agent.features.mapping.parameters import MappingMotionNoise
+from gnd.vehicle_agent.features.mapping.sensors import WheelsAndGyro
+from gnd.vehicle_agent.features.view import wrapped
 
 GAP_S = 0.1  # samples farther apart leave something unknown between them
+_GAP_MPS2, _GAP_RADPS2 = 2.0, 0.3  # so much may speed and yaw rate change in a gap, unseen
 LEAST_M2, LEAST_RAD2 = 1e-6, 1e-9  # variances of a step: stiffer ones leave the graph ill-conditioned
 
 
@@ -31,11 +33,6 @@ def rotated(yaw_rad: F64, xy_m: F64) -> F64:
     """(..., 2) turned counter-clockwise by (...,) yaw."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.stack([c * xy_m[..., 0] - s * xy_m[..., 1], s * xy_m[..., 0] + c * xy_m[..., 1]], axis=-1)
-
-
-def wrapped(angle_rad: F64) -> F64:
-    """(...,) the same angles in -pi … pi."""
-    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def relative(base: F64, pose: F64) -> F64:
@@ -68,7 +65,7 @@ class DeadReckoning:
     bias_radps: float
 
     @classmethod
-    def of(cls, motion: MotionTrack, noise: MappingMotionNoise, scale: float, bias_radps: float) -> "DeadReckoning":
+    def of(cls, motion: MotionTrack, noise: WheelsAndGyro, scale: float, bias_radps: float) -> "DeadReckoning":
         """Integrate: speed times (1 + scale), yaw rate less the bias, both taken as linear between samples."""
         dt = np.diff(motion.t_ns) * 1e-9
         run = 0.5 * (motion.speed_mps[1:] + motion.speed_mps[:-1]) * (1.0 + scale) * dt
@@ -138,9 +135,9 @@ def _summed(steps: F64) -> F64:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _white(dt: F64, run_m: F64, noise: MappingMotionNoise) -> F64:
+def _white(dt: F64, run_m: F64, noise: WheelsAndGyro) -> F64:
     """(S, 2) variance so far of way and yaw: white noise of the samples, slip, and what happens in gaps."""
     gap = np.where(dt > GAP_S, dt, 0.0)
-    along = (noise.wheel_mps * dt) ** 2 + noise.slip_m**2 * run_m + (0.5 * noise.gap_mps2 * gap**2) ** 2
-    yaw = (noise.gyro_radps * dt) ** 2 + noise.slip_rad**2 * run_m + (0.5 * noise.gap_radps2 * gap**2) ** 2
+    along = (noise.wheel_mps * dt) ** 2 + noise.slip_m**2 * run_m + (0.5 * _GAP_MPS2 * gap**2) ** 2
+    yaw = (noise.gyro_radps * dt) ** 2 + noise.slip_rad**2 * run_m + (0.5 * _GAP_RADPS2 * gap**2) ** 2
     return np.stack([_summed(along), _summed(yaw)], axis=1)

@@ -7,25 +7,26 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, rotated
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes, KnownPoses
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes
 from gnd.vehicle_agent.features.mapping.graph import solve
 from gnd.vehicle_agent.features.mapping.graph_edges import (
     NO_FIX_NODES,
-    NO_MATCHES,
     FixNodes,
-    PoseMatches,
     Problem,
     State,
 )
 from gnd.vehicle_agent.features.mapping.landmarks import Sight
-from gnd.vehicle_agent.features.mapping.parameters import MappingGnssNoise, NewLayerParameters
+from gnd.vehicle_agent.features.mapping.sensors import DriveSensors, GnssReceiver
 
 _KEYFRAME_M: Final = 5.0
 _KEYFRAME_S: Final = 1.0
 """A pose of the graph every so many metres, and every so many seconds."""
 
+_FIX_NODE_S: Final = 1.0
+"""A state of the GNSS's slow error at least this far from the next."""
+
 SMOOTHINGS = 2  # of motion and fixes, each with the wheel scale and gyro bias of the one before
-CHORD_M = 60.0  # GNSS tells a direction over so long a way
+CHORD_M = 60.0  # GNSS gives a direction over so long a way
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,22 +34,22 @@ class DriveNodes:
     """A drive and its keyframes. t_ns: (K,)."""
 
     drive: FeatureDrive
-    parameters: NewLayerParameters
+    sensors: DriveSensors
     t_ns: I64
     reckoning: DeadReckoning
     calibration: F64
 
     @classmethod
-    def of(cls, drive: FeatureDrive, parameters: NewLayerParameters) -> "DriveNodes":
+    def of(cls, drive: FeatureDrive, sensors: DriveSensors) -> "DriveNodes":
         """Keyframes by the way driven; no wheel scale and gyro bias known yet."""
-        reckoning = DeadReckoning.of(drive.motion, parameters.motion, 0.0, 0.0)
+        reckoning = DeadReckoning.of(drive.motion, sensors.motion, 0.0, 0.0)
         t_ns = reckoning.keyframes(_KEYFRAME_M, _KEYFRAME_S)
-        return cls(drive, parameters, t_ns, reckoning, np.zeros(2))
+        return cls(drive, sensors, t_ns, reckoning, np.zeros(2))
 
     def calibrated(self, calibration: F64) -> "DriveNodes":
         """The same keyframes, dead reckoning with wheel scale and gyro bias (2,)."""
         scale, bias = calibration.tolist()
-        reckoning = DeadReckoning.of(self.drive.motion, self.parameters.motion, scale, bias)
+        reckoning = DeadReckoning.of(self.drive.motion, self.sensors.motion, scale, bias)
         return replace(self, reckoning=reckoning, calibration=calibration)
 
     def sight(self, t_ns: I64) -> Sight:
@@ -59,19 +60,18 @@ class DriveNodes:
         return Sight(key, relative(base, here), way)
 
     def problem(self, pose: F64) -> Problem:
-        """Motion, fixes and told poses as edges; pose: (K, 3) as known so far."""
+        """Motion and fixes as edges; pose: (K, 3) as known so far."""
         return Problem(
             self.reckoning.steps(self.t_ns),
             self.calibration,
-            self._fix_nodes(self.drive.fixes, pose, self.parameters.gnss),
-            poses=self._told(self.drive.poses),
+            self._fix_nodes(self.drive.fixes, pose, self.sensors.gnss),
         )
 
-    def _fix_nodes(self, fixes: GnssFixes, pose: F64, noise: MappingGnssNoise) -> FixNodes:
+    def _fix_nodes(self, fixes: GnssFixes, pose: F64, noise: GnssReceiver) -> FixNodes:
         """Fixes brought to keyframes and averaged: what is white in them becomes less."""
         if len(fixes.t_ns) == 0:
             return NO_FIX_NODES
-        base = _apart(self.t_ns, round(noise.every_s * 1e9))
+        base = spaced(self.t_ns, round(_FIX_NODE_S * 1e9))
         node = base[nearest(self.t_ns[base], fixes.t_ns)]
         driven = relative(self.reckoning.at(self.t_ns[node]), self.reckoning.at(fixes.t_ns))
         xy = fixes.xy_m - rotated(pose[node, 2], driven[:, :2])
@@ -82,39 +82,18 @@ class DriveNodes:
         slow = noise.sigma_m**2 * span_s / (6.0 * noise.correlation_s)
         return FixNodes(key, (self.t_ns[key] - self.t_ns[0]) * 1e-9, mean, noise.white_m**2 / count + slow)
 
-    def _told(self, poses: KnownPoses) -> PoseMatches:
-        """Poses of another localiser brought to the nearest keyframes."""
-        if len(poses.t_ns) == 0:
-            return NO_MATCHES
-        key, offset, _ = self.sight(poses.t_ns)
-        back = relative(offset, np.zeros_like(offset))
-        c, s = np.cos(poses.pose[:, 2]), np.sin(poses.pose[:, 2])
-        R = np.zeros((len(key), 3, 3))
-        R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, -s, s, c, 1.0
-        own = R.transpose(0, 2, 1) @ poses.cov @ R
-        adjoint = _adjoint(back)
-        information = np.asarray(np.linalg.inv(adjoint @ own @ adjoint.transpose(0, 2, 1)), np.float64)
-        return PoseMatches(key, composed(poses.pose, back), np.zeros_like(back), information)
-
     def first_state(self) -> tuple["DriveNodes", State]:
-        """Poses (K, 3) by smoothing motion, fixes and told poses: no features yet, no map."""
+        """Poses (K, 3) by smoothing motion and fixes: no features yet, no map."""
         nodes = self.calibrated(np.array([0.0, self._first_bias()]))
         state = State(nodes._laid_out(), np.empty((0, 2)), nodes.calibration)
         for _ in range(SMOOTHINGS):
             nodes = nodes.calibrated(state.calibration)
-            state = solve(nodes.problem(state.pose), state, self.parameters).state
+            state = solve(nodes.problem(state.pose), state, self.sensors).state
         return nodes, state
-
-    def _places(self) -> tuple[I64, F64]:
-        """(P,) times and (P, 2) places that fixes and told poses give."""
-        t_ns = np.concatenate([self.drive.fixes.t_ns, self.drive.poses.t_ns])
-        xy = np.concatenate([self.drive.fixes.xy_m, self.drive.poses.pose[:, :2]])
-        order = np.argsort(t_ns, kind="stable")
-        return t_ns[order], xy[order]
 
     def _first_bias(self) -> float:
         """Gyro bias [rad/s] roughly: how directions by GNSS turn against those of dead reckoning."""
-        t_ns, xy = self._places()
+        t_ns, xy = self.drive.fixes.t_ns, self.drive.fixes.xy_m
         way = np.interp(t_ns - self.t_ns[0], self.reckoning.t_ns - self.t_ns[0], self.reckoning.way_m)
         last = np.searchsorted(way, way + CHORD_M)
         first = np.flatnonzero(last < len(way))
@@ -125,29 +104,17 @@ class DriveNodes:
         off = np.unwrap(np.arctan2(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0], (a * b).sum(axis=1)))
         t_s = (t_ns[first] - t_ns[0]) * 1e-9
         slope = float(np.polyfit(t_s, off, 1)[0]) if np.ptp(t_s) > 0 else 0.0
-        limit = 4.0 * self.parameters.motion.gyro_bias_radps
+        limit = 4.0 * self.sensors.motion.gyro_bias_radps
         return float(np.clip(-slope, -limit, limit))
 
     def _laid_out(self) -> F64:
         """(K, 3) dead reckoning laid onto the fixes as a whole: turned and shifted, least squares."""
-        t_ns, xy = self._places()
+        t_ns, xy = self.drive.fixes.t_ns, self.drive.fixes.xy_m
         driven, base = self.reckoning.at(t_ns)[:, :2], self.reckoning.at(self.t_ns)
         a, b = driven - driven.mean(axis=0), xy - xy.mean(axis=0)
         yaw = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
-        if len(self.drive.poses.t_ns) and np.ptp(driven, axis=0).max() < CHORD_M:
-            yaw = float(self.drive.poses.pose[0, 2] - self.reckoning.at(self.drive.poses.t_ns[:1])[0, 2])
         shift = xy.mean(axis=0) - rotated(np.array(yaw), driven.mean(axis=0))
         return composed(np.broadcast_to(np.array([*shift, yaw]), base.shape), base)
-
-
-def _adjoint(pose: F64) -> F64:
-    """(P, 3, 3) that carries a pose's covariance, in its own frame, to what is `pose` (P, 3) in that frame."""
-    inverse = relative(pose, np.zeros_like(pose))
-    A = np.zeros((len(pose), 3, 3))
-    c, s = np.cos(inverse[:, 2]), np.sin(inverse[:, 2])
-    A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1], A[:, 2, 2] = c, -s, s, c, 1.0
-    A[:, 0, 2], A[:, 1, 2] = inverse[:, 1], -inverse[:, 0]
-    return A
 
 
 def nearest(base: I64, values: I64) -> I64:
@@ -158,10 +125,10 @@ def nearest(base: I64, values: I64) -> I64:
     return np.asarray(np.where(values - base[after - 1] <= base[after] - values, after - 1, after))
 
 
-def _apart(t_ns: I64, least_ns: int) -> I64:
-    """Rows of increasing times (K,) of which each is at least `least_ns` after the one before."""
+def spaced(values: I64 | F64, least: float) -> I64:
+    """Rows of increasing values (K,) of which each is larger than the one before by `least` or more."""
     kept = [0]
-    for row in range(1, len(t_ns)):
-        if t_ns[row] - t_ns[kept[-1]] >= least_ns:
+    for row in range(1, len(values)):
+        if values[row] - values[kept[-1]] >= least:
             kept.append(row)
     return np.array(kept, np.int64)

@@ -18,11 +18,12 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.errors import NewLayerError
 from gnd.vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, GraphAnchors, PoseMatches, Problem, State, Ties
-from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
+from gnd.vehicle_agent.features.mapping.sensors import DriveSensors
 
 CALIBRATION = gtsam.symbol("c", 0)
 PINNED_RAD = 1e-3  # sigma of the rotation of what has none
-FREE_RAD = 1e4  # sigma of a rotation of which nothing is said
+FREE_RAD = 1e4  # sigma of a rotation that is not constrained
+ROBUST_K = 3.0  # Huber's k of fixes, measurements and matches with lanes, in sigmas
 ITERATIONS = 30
 LINEARISATIONS = 10
 STAYS = 1e-4  # root mean square step of all numbers (m, rad) below which the optimum has been found
@@ -59,7 +60,7 @@ class Solution:
 
 @contextmanager
 def _determined(n_poses: int) -> Iterator[None]:
-    """What GTSAM says of a graph that leaves something open, by its name."""
+    """GTSAM's error for a graph that is not determined, under our name."""
     try:
         yield
     except RuntimeError as error:
@@ -67,7 +68,7 @@ def _determined(n_poses: int) -> Iterator[None]:
         raise NewLayerError(f"{what}: {str(error).strip().splitlines()[0]}") from error
 
 
-def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Solution:
+def solve(problem: Problem, start: State, sensors: DriveSensors) -> Solution:
     """Minimise Eq. (6), or with matches Eq. (10), by Levenberg-Marquardt from `start`.
 
     Raises:
@@ -75,18 +76,19 @@ def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Sol
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     _add_poses(values, start)
-    _add_calibration(graph, parameters)
-    _add_fixes(graph, values, problem.fixes, start, parameters)
-    _add_ties(graph, problem.ties, parameters.landmarks.robust_k)
+    _add_calibration(graph, sensors)
+    _add_fixes(graph, values, problem.fixes, start, sensors)
+    _add_ties(graph, problem.ties)
     _add_anchors(graph, problem.anchors)
-    own = _motion(problem) + _matches(problem.lanes, parameters.lanes.robust_k) + _matches(problem.poses, None)
+    own = _motion(problem) + _matches(problem.lanes)
     with _determined(len(start.pose)):
         linear, optimum = _optimised(graph, own, values)
     cost = 2.0 * (graph.error(optimum) + sum(factor.error(optimum) for factor in own))  # Eq. (6), (10)
     return Solution(_state(optimum, len(start.pose), len(start.xy_m)), cost, linear, optimum)
 
 
-def _pose2(pose: F64) -> Any:
+def pose2(pose: F64) -> Any:
+    """A pose (3,) as GTSAM has it."""
     return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
 
 
@@ -135,7 +137,7 @@ def _state(values: Any, n_poses: int, n_landmarks: int) -> State:
 
 def _add_poses(values: Any, start: State) -> None:
     for k, pose in enumerate(start.pose):
-        values.insert(_x(k), _pose2(pose))
+        values.insert(_x(k), pose2(pose))
     for n, xy in enumerate(start.xy_m):
         values.insert(_l(n), xy)
     values.insert(CALIBRATION, start.calibration)
@@ -153,7 +155,7 @@ def _motion(problem: Problem) -> list[Any]:
 
 
 class _Motion:
-    """Eq. (1) as GTSAM asks for it: how far the motion between two poses is from what wheels and gyro say."""
+    """Eq. (1) as GTSAM asks for it: the residual of the motion between two poses."""
 
     __slots__ = ("at", "by_calibration", "delta", "keys")
 
@@ -180,22 +182,22 @@ class _Motion:
         )
 
 
-def _add_calibration(graph: Any, parameters: NewLayerParameters) -> None:
-    sigmas = np.array([parameters.motion.wheel_scale, parameters.motion.gyro_bias_radps])
+def _add_calibration(graph: Any, sensors: DriveSensors) -> None:
+    sigmas = np.array([sensors.motion.wheel_scale, sensors.motion.gyro_bias_radps])
     graph.add(gtsam.PriorFactorPoint2(CALIBRATION, np.zeros(2), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
 
 
-def _add_fixes(graph: Any, values: Any, fixes: FixNodes, start: State, parameters: NewLayerParameters) -> None:
+def _add_fixes(graph: Any, values: Any, fixes: FixNodes, start: State, sensors: DriveSensors) -> None:
     """Fixes hang on poses through the receiver's slow error: pose = error + fix (docs/decisions/0069)."""
     if len(fixes.key) == 0:
         return
-    springs = gauss_markov_springs(fixes.t_s, parameters.gnss.sigma_m, parameters.gnss.correlation_s)
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(parameters.gnss.robust_k)
+    springs = gauss_markov_springs(fixes.t_s, sensors.gnss.sigma_m, sensors.gnss.correlation_s)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
     for n, (key, xy, variance) in enumerate(zip(fixes.key, fixes.xy_m, fixes.variance_m2, strict=True)):
-        values.insert(_b(n), _pose2(np.array([*(start.pose[key, :2] - xy), 0.0])))
+        values.insert(_b(n), pose2(np.array([*(start.pose[key, :2] - xy), 0.0])))
         graph.add(gtsam.PriorFactorPose2(_b(n), gtsam.Pose2(), _spring(springs.prior[n], PINNED_RAD)))
         noise = gtsam.noiseModel.Robust.Create(huber, _spring(1.0 / variance, FREE_RAD))
-        # The rotation says nothing; that it is about right keeps GTSAM's error in metres of the map's axes.
+        # The rotation is not constrained; that it is about right keeps GTSAM's error in metres of the map's axes.
         measured = gtsam.Pose2(xy[0], xy[1], start.pose[key, 2])
         graph.add(gtsam.BetweenFactorPose2(_b(n), _x(int(key)), measured, noise))
     for n, weight in enumerate(springs.between):
@@ -207,29 +209,28 @@ def _spring(information: float, sigma_rad: float) -> Any:
     return gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_m, sigma_m, sigma_rad]))
 
 
-def _add_ties(graph: Any, ties: Ties, robust_k: float) -> None:
+def _add_ties(graph: Any, ties: Ties) -> None:
     """Eq. (4)-(5): bearing and range of a feature from a keyframe."""
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
     for key, landmark, (bearing, distance), cov in zip(*ties, strict=True):
         noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov))
         seen = gtsam.Rot2.fromAngle(bearing)
         graph.add(gtsam.BearingRangeFactor2D(_x(int(key)), _l(int(landmark)), seen, distance, noise))
 
 
-def _matches(matches: PoseMatches, robust_k: float | None) -> list[Any]:
-    """Eq. (8)-(9); the information may be singular: nothing is then said along that direction."""
-    unit = gtsam.noiseModel.Unit.Create(3)
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k or np.inf)
-    noise = unit if robust_k is None else gtsam.noiseModel.Robust.Create(huber, unit)
+def _matches(matches: PoseMatches) -> list[Any]:
+    """Eq. (8)-(9); the information may be singular: a direction is then not constrained."""
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
+    noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(3))
     return [
-        gtsam.CustomFactor(noise, [_x(int(key))], _LandmarkMatch(_pose2(pose), off, root_of(information)))
+        gtsam.CustomFactor(noise, [_x(int(key))], _LandmarkMatch(pose2(pose), off, root_of(information)))
         for key, pose, off, information in zip(*matches, strict=True)
     ]
 
 
 class _LandmarkMatch:
-    """Eq. (8) as GTSAM asks for it. A prior at the matched pose would not do: along lanes that say little that pose
-    may lie far away, and what holds near by does not hold there.
+    """Eq. (8) as GTSAM asks for it. A prior at the matched pose would not do: along lanes that constrain little that
+    pose may lie far away, and what holds near by does not hold there.
     """
 
     __slots__ = ("off", "pose", "root")

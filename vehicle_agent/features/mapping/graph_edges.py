@@ -36,7 +36,7 @@ class Ties(NamedTuple):
 
 
 class PoseMatches(NamedTuple):
-    """Poses of keyframes told by something else than motion and features: lanes (Eq. 8), or another localiser."""
+    """Poses of keyframes by lanes (Eq. 8)."""
 
     key: I64
     """(P,)"""
@@ -45,7 +45,7 @@ class PoseMatches(NamedTuple):
     off: F64
     """(P, 3) that the keyframe is off from `pose`, in its frame (x ahead, y left, yaw; the logarithm)."""
     information: F64
-    """(P, 3, 3) of `off`; may be singular: nothing is then said along some direction."""
+    """(P, 3, 3) of `off`; may be singular: a direction is then not constrained."""
 
 
 class GraphAnchors(NamedTuple):
@@ -74,7 +74,6 @@ class Problem:
     fixes: FixNodes = NO_FIX_NODES
     ties: Ties = NO_TIES
     lanes: PoseMatches = NO_MATCHES
-    poses: PoseMatches = NO_MATCHES
     anchors: GraphAnchors = NO_ANCHORS
 
 

@@ -16,7 +16,7 @@ from gnd.vehicle_agent.features.mapping.lane_map import LaneMap
 
 LANES: Final = "lanes"
 LEAST_LANE_M: Final = 5.0
-"""Shorter pieces of a lane tell no direction."""
+"""Shorter pieces of a lane give no direction."""
 
 
 class HeldMap:

@@ -12,17 +12,18 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated, wrapped
+from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated
 from gnd.vehicle_agent.features.mapping.feature_drive import Measurements
 from gnd.vehicle_agent.features.mapping.graph import bearing_range
 from gnd.vehicle_agent.features.mapping.graph_edges import Ties
 from gnd.vehicle_agent.features.slamcu.association import FORBIDDEN, associate
+from gnd.vehicle_agent.features.view import wrapped
 
 _GATE_CHI2: Final = 13.8
 """A measurement farther than this from a feature (two degrees of freedom) is none of it; 0.1 % of the right ones
 are."""
 LANDMARK_MIN_HITS: Final = 5
-"""A feature with fewer measurements is a ghost and not told."""
+"""A feature with fewer measurements is a ghost: it is left out."""
 LANDMARK_REVISIT_M: Final = 1.5
 """Sigma of what the first poses are off by against those of a passage `revisit_way_m` before."""
 _REVISIT_WAY_M: Final = 150.0
@@ -150,7 +151,6 @@ def assigned(m: Measurements, sight: Sight, pose: F64, xy_m: F64, kind: I64, sla
         xy_m: (N, 2) features.
         kind: (N,) theirs.
         slack_m: (N,) sigma of where a feature is as seen from the poses around, beside the sensor's noise.
-        parameters: the gate.
     """
     owner = np.full(len(m), NONE, np.int64)
     at = composed(pose[sight.key], sight.offset)
@@ -233,7 +233,6 @@ def doubles(m: Measurements, owner: I64, at: LandmarkPlaces) -> list[tuple[int, 
         m: M measurements.
         owner: (M,) features of them, of N.
         at: N features.
-        parameters: how near, and what is side by side.
     """
     looks = [np.unique(m.look[owner == n]) for n in range(len(at.xy_m))]
     distance = np.hypot(*np.moveaxis(at.xy_m[:, None] - at.xy_m[None], 2, 0))

@@ -1,8 +1,8 @@
 """Looks at lane markings against the map's: how far off each polyline lies, and which marking it is.
 
 A polyline of a look errs as a whole: it is moved sideways by N(0, l²) m and turned by N(0, (2.5 l)²)° about the vehicle
-(Kim et al. 2018, Table 1). Hence it tells two numbers, not as many as it has points. Which marking it is, is asked for
-all polylines of a look together, as they lie side by side: alone, one that is 2 m off belongs to the next marking.
+(Kim et al. 2018, Table 1). Hence it measures two numbers, not as many as it has points. Which marking it is, is decided
+for all polylines of a look together, as they lie side by side: alone, one that is 2 m off belongs to the next marking.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from gnd.vehicle_agent.features.mapping.lane_map import SAMPLE_M, LaneMap
 _SIGMA_M: Final = 1.0
 _SIGMA_RAD: Final = radians(2.5)
 """Of a polyline of one look: how far off it lies beside the vehicle, and how far it is turned (Table 1 of the paper
-with l = 1); used where the look does not say."""
+with l = 1); used where the look has no sigmas."""
 _BESIDE_M: Final = 15.0
 """Lanes this far beside the vehicle are looked at."""
 LANE_GATE: Final = 3.5
@@ -30,7 +30,7 @@ LANE_GATE: Final = 3.5
 
 POINTS = 8  # of a polyline that are compared with the map
 MAX_LANES = 8  # beside each other that are looked at
-LEAST_M = 5.0  # a polyline whose compared points span less tells no direction
+LEAST_M = 5.0  # a polyline whose compared points span less gives no direction
 IMPOSSIBLE = 1e6
 SLACK = np.array([0.3, np.radians(1.0)])  # what poses may be off by beside the sensor's noise, across and turned
 
@@ -72,10 +72,10 @@ class Offsets(NamedTuple):
     """(P, M) lane of the map, -1 = none."""
     left_m: F64
     """(P, M) how far left of the vehicle the lane is."""
-    told: F64
+    residual: F64
     """(P, M, 2) offset [m] and turn [rad] of the polyline against the lane."""
     by_pose: F64
-    """(P, M, 2, 3) of told by x, y, yaw of the window's pose, in its frame."""
+    """(P, M, 2, 3) of residual by x, y, yaw of the window's pose, in its frame."""
     cost: F64
     """(P, M), `IMPOSSIBLE` where the lane is none or too short."""
 
@@ -88,7 +88,6 @@ def offsets(lines: Polylines, lanes: LaneMap, at: F64, base: F64) -> Offsets:
         lanes: of the map.
         at: (L, 3) poses of the looks in the map frame, as believed.
         base: (L, 3) poses of their windows.
-        p: how far to look.
     """
     beside = _beside(lanes, at)
     lane, sample, left = beside[0][lines.look], beside[1][lines.look], beside[2][lines.look]
@@ -103,11 +102,11 @@ def offsets(lines: Polylines, lanes: LaneMap, at: F64, base: F64) -> Offsets:
     normal = rotated(np.broadcast_to(-at[:, None, None, 2], start.shape), feet.normal)
     E = np.stack([normal[..., 1], _turning(normal, lines.xy_m[:, None])], axis=-1) * feet.valid[..., None]
     fit, enough = _fit(E, feet.valid, lines.xy_m)
-    told = np.einsum("pmiq,pmq->pmi", fit, np.where(feet.valid, feet.off_m, 0.0))
+    residual = np.einsum("pmiq,pmq->pmi", fit, np.where(feet.valid, feet.off_m, 0.0))
     N = _by_pose(feet.normal, here[:, None], base) * feet.valid[..., None]
-    cost = ((told / lines.tolerance[:, None]) ** 2).sum(axis=2)
+    cost = ((residual / lines.tolerance[:, None]) ** 2).sum(axis=2)
     cost = np.where(enough & (lane >= 0), cost, IMPOSSIBLE)
-    return Offsets(lane, left, told, fit @ N, cost)
+    return Offsets(lane, left, residual, fit @ N, cost)
 
 
 def _as_poses(xy_m: F64) -> F64:
@@ -162,7 +161,6 @@ def choices(lines: Polylines, o: Offsets, aside_m: F64) -> tuple[I64, F64]:
         lines: P polylines.
         o: theirs against the lanes.
         aside_m: (G,) or (L, G) moves tried.
-        p: gate.
 
     Returns:
         (P, G) column of `o` for each, -1 = none; (L, G) cost of each look in squared sigmas.
@@ -176,7 +174,7 @@ def choices(lines: Polylines, o: Offsets, aside_m: F64) -> tuple[I64, F64]:
     np.maximum.at(n_beside, lines.look, (o.lane >= 0).sum(axis=1))
     first = np.concatenate([[0], np.cumsum(seen)[:-1]])
     likely = np.argmin(o.cost, axis=1)[:, None]
-    left = np.take_along_axis(o.left_m + o.told[..., 0], likely, axis=1)[:, 0]
+    left = np.take_along_axis(o.left_m + o.residual[..., 0], likely, axis=1)[:, 0]
     for n_seen, n_lanes in {(int(a), int(b)) for a, b in zip(seen, n_beside, strict=True) if a and b}:
         looks = np.flatnonzero((seen == n_seen) & (n_beside == n_lanes))
         rows = first[looks][:, None] + np.arange(n_seen)
@@ -187,8 +185,8 @@ def choices(lines: Polylines, o: Offsets, aside_m: F64) -> tuple[I64, F64]:
 
 def _pair_costs(lines: Polylines, o: Offsets, rows: I64, n_lanes: int, aside: F64) -> F64:
     """(L, S, M, G) cost of each polyline for each lane and move; never more than the gate."""
-    off = o.told[rows, :n_lanes, 0, None] + aside[:, None, None]
-    turn = o.told[rows, :n_lanes, 1, None] / lines.tolerance[rows, 1][..., None, None]
+    off = o.residual[rows, :n_lanes, 0, None] + aside[:, None, None]
+    turn = o.residual[rows, :n_lanes, 1, None] / lines.tolerance[rows, 1][..., None, None]
     cost = (off / lines.tolerance[rows, 0][..., None, None]) ** 2 + turn**2
     cost = np.where(o.cost[rows, :n_lanes, None] >= IMPOSSIBLE, np.inf, cost)
     return np.minimum(cost, 2.0 * LANE_GATE**2)

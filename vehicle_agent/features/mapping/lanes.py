@@ -15,12 +15,14 @@ import numpy as np
 from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import LaneLook
 from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated
-from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes, nearest
+from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes, nearest, spaced
+from gnd.vehicle_agent.features.mapping.graph import pose2
 from gnd.vehicle_agent.features.mapping.graph_edges import NO_MATCHES, PoseMatches
 from gnd.vehicle_agent.features.mapping.lane_looks import LANE_GATE, Offsets, Polylines, choices, offsets
 from gnd.vehicle_agent.features.mapping.lane_map import LaneMap, gicp
-from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
 
+_MAP_SIGMA_M: Final = 0.01
+"""Of the lines of the HD map."""
 _WINDOW_M: Final = 20.0
 """Looks of so long a way are put together."""
 _SEARCH_M: Final = 4.0
@@ -30,13 +32,13 @@ _MAX_CORRESPONDENCE_M: Final = 1.5
 _MIN_POLYLINES: Final = 3
 """A window of fewer polylines is not matched."""
 _INFORMATION: Final = 0.75
-"""The share of what polylines would say if it were certain which lane each is. With the paper's noise some are taken
-for their neighbour; with 0.75 the squared errors of features are as large as they should be."""
+"""The share of the information that polylines would have if it were certain which lane each is. With the paper's noise
+some are taken for their neighbour; with 0.75 the squared errors of features are as large as they should be."""
 
 __all__ = ["LaneMap", "LaneMatcher"]
 
 TURN_AT_M = 20.0  # turns and shifts are compared at this distance
-MUCH = 0.05  # share of it above which GICP may say it
+MUCH = 0.05  # share of it above which GICP corrects a direction
 NOTHING = 1e-4  # share of the best direction's information below which a direction is not known
 ASIDE_STEP_M = 0.25
 ASIDE_SIGMA_M = 2.5  # what the first poses may be off by to either side
@@ -47,10 +49,10 @@ SEEN_M = (5.0, 35.0)  # ahead of the vehicle: the part of lanes that GICP is giv
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowMatch:
-    """What the looks of W windows say. key: (W,). base: (W, 3) poses they were compared at.
+    """Matches of the looks of W windows. key: (W,). base: (W, 3) poses they were compared at.
 
     off: (W, 3) that the pose is off from the base, in its frame. information: (W, 3, 3) of it, singular where lanes
-    say nothing. strong: (W, 3, 3) projection of `off` onto what lanes say well.
+    constrain nothing. strong: (W, 3, 3) projection of `off` onto what lanes constrain well.
     """
 
     key: I64
@@ -65,7 +67,7 @@ class _Chosen(NamedTuple):
 
     window: I64
     lane: I64
-    told: F64
+    residual: F64
     by_pose: F64
     variance: F64
 
@@ -73,13 +75,11 @@ class _Chosen(NamedTuple):
 class LaneMatcher:
     """Matches the lane looks of a drive, again and again as its poses become better."""
 
-    def __init__(
-        self, lanes: LaneMap, looks: tuple[LaneLook, ...], nodes: DriveNodes, parameters: LaneParameters
-    ) -> None:
-        self.lanes, self.parameters = lanes, parameters
+    def __init__(self, lanes: LaneMap, looks: tuple[LaneLook, ...], nodes: DriveNodes) -> None:
+        self.lanes = lanes
         self.lines = Polylines.of(looks)
         self.t_ns = np.array([look.t_ns for look in looks], np.int64)
-        self.keys = _spaced(nodes.sight(nodes.t_ns).way_m, _WINDOW_M)
+        self.keys = spaced(nodes.sight(nodes.t_ns).way_m, _WINDOW_M)
         self.window = nearest(nodes.t_ns[self.keys], self.t_ns) if len(looks) else np.empty(0, np.int64)
         self._searched = False
 
@@ -106,21 +106,21 @@ class LaneMatcher:
         self._searched = True
         column = choices(self.lines, o, aside)[0][:, 0]
         rows = np.arange(len(column))
-        told = o.told[rows, column]
-        moved = told[:, 0] + aside[self.lines.look, 0]
-        squared = np.stack([moved, told[:, 1]], axis=1) ** 2 / self.lines.tolerance**2
+        residual = o.residual[rows, column]
+        moved = residual[:, 0] + aside[self.lines.look, 0]
+        squared = np.stack([moved, residual[:, 1]], axis=1) ** 2 / self.lines.tolerance**2
         good = (column >= 0) & (squared.max(axis=1) <= LANE_GATE**2) & (o.cost[rows, column] < 1e5)
         window, lane = self.window[self.lines.look], o.lane[rows, column]
         variance = self._variance(window, lane, good)
         kept = np.flatnonzero(good)
-        return _Chosen(window[kept], lane[kept], told[kept], o.by_pose[kept, column[kept]], variance[kept])
+        return _Chosen(window[kept], lane[kept], residual[kept], o.by_pose[kept, column[kept]], variance[kept])
 
     def _variance(self, window: I64, lane: I64, good: F64) -> F64:
         """(P, 2) of offset and turn; the map's own error does not grow less with more looks."""
         group = window * len(self.lanes) + np.maximum(lane, 0)
         count = np.bincount(group, good, minlength=len(self.keys) * len(self.lanes))
         variance = self.lines.sigma**2
-        variance[:, 0] += count[group] * self.parameters.map_sigma_m**2
+        variance[:, 0] += count[group] * _MAP_SIGMA_M**2
         return np.asarray(variance)
 
     def _search(self, o: Offsets, n_looks: int) -> F64:
@@ -146,7 +146,7 @@ class LaneMatcher:
         return WindowMatch(self.keys, base, off, _INFORMATION * information, strong)
 
     def _polished(self, found: WindowMatch, c: _Chosen, rows: I64) -> F64:
-        """(W, 3) what the poses of windows are off by GICP, Eq. (8), where lanes say it well."""
+        """(W, 3) what the poses of windows are off by GICP, Eq. (8), where lanes constrain them well."""
         pairs, group = np.unique(np.stack([c.window, c.lane], axis=1), axis=0, return_inverse=True)
         off, _, strong = solved(*_normal_equations(c, group.ravel(), len(pairs)))
         of_lane = np.einsum("nij,nj->ni", strong, off)
@@ -182,13 +182,13 @@ def _normal_equations(c: _Chosen, group: I64, n: int) -> tuple[F64, F64]:
     """(n, 3, 3) and (n, 3): information of groups of polylines about the pose's error, and its right-hand side."""
     A, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
     np.add.at(A, group, np.einsum("sij,si,sik->sjk", c.by_pose, 1.0 / c.variance, c.by_pose))
-    np.add.at(g, group, np.einsum("sij,si,si->sj", c.by_pose, 1.0 / c.variance, c.told))
+    np.add.at(g, group, np.einsum("sij,si,si->sj", c.by_pose, 1.0 / c.variance, c.residual))
     return A, g
 
 
 def solved(A: F64, g: F64) -> tuple[F64, F64, F64]:
-    """Shortest solutions (n, 3) of A x = g; A (n, 3, 3) without directions of which it says next to nothing; and
-    projections (n, 3, 3) onto those of which it says much.
+    """Shortest solutions (n, 3) of A x = g; A (n, 3, 3) without directions that it hardly constrains; and
+    projections (n, 3, 3) onto those that it constrains well.
     """
     scale = np.array([1.0, 1.0, 1.0 / TURN_AT_M])
     values, vectors = np.linalg.eigh(A * scale[:, None] * scale)
@@ -201,25 +201,12 @@ def solved(A: F64, g: F64) -> tuple[F64, F64, F64]:
     return x, np.asarray(kept / scale[:, None] / scale), np.asarray(strong * scale[:, None] / scale)
 
 
-def _pose2(pose: F64) -> gtsam.Pose2:
-    return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
-
-
 def moved(base: F64, off: F64) -> F64:
     """(3,) the pose that is `off` (3,), a logarithm, from `base` (3,)."""
-    pose = _pose2(base).compose(gtsam.Pose2.Expmap(off))
+    pose = pose2(base).compose(gtsam.Pose2.Expmap(off))
     return np.array([pose.x(), pose.y(), pose.theta()])
 
 
 def logarithm(base: F64, pose: F64) -> F64:
     """(3,) how far `pose` (3,) is from `base` (3,), in its frame."""
-    return np.asarray(gtsam.Pose2.Logmap(_pose2(base).between(_pose2(pose))))
-
-
-def _spaced(way_m: F64, least_m: float) -> I64:
-    """Rows of a rising way (K,) of which each is at least `least_m` past the one before."""
-    kept = [0]
-    for row in range(1, len(way_m)):
-        if way_m[row] - way_m[kept[-1]] >= least_m:
-            kept.append(row)
-    return np.array(kept, np.int64)
+    return np.asarray(gtsam.Pose2.Logmap(pose2(base).between(pose2(pose))))

@@ -1,4 +1,4 @@
-"""What a mapped stretch says of each tile: features found, map features judged, and where was looked."""
+"""What is reported of a mapped stretch, tile by tile: features found, map features judged, cells looked at."""
 
 from collections import defaultdict
 from math import nan
@@ -7,11 +7,12 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureChange, Found, Seen
-from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
+from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
 from gnd.vehicle_agent.features.layer import of_counts
-from gnd.vehicle_agent.features.layer_parameters import LayerParameters
+from gnd.vehicle_agent.features.layer_parameters import view_of
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
 from gnd.vehicle_agent.features.mapping.held_map import HeldMap
 from gnd.vehicle_agent.features.mapping.new_layer import NewLayer
@@ -23,7 +24,6 @@ def changes_of(
     drive: FeatureDrive,
     held: HeldMap,
     layer: LayerParameters,
-    coverage: CoverageParameters,
     height_m: float,
 ) -> list[FeatureChange]:
     """What is reported of a stretch, tile by tile.
@@ -31,14 +31,13 @@ def changes_of(
     Args:
         found: the graph's result.
         drive: the stretch.
-        held: what the map says.
+        held: the map's tiles.
         layer: whose features they are.
-        coverage: when a place counts as looked at.
-        height_m: stands in for heights, which the plane does not tell; map frame.
+        height_m: stands in for heights, which a plane does not have; map frame.
     """
     times = np.array([look.t_ns for look in drive.looks], np.int64)
     poses = found.path.at(times[(times >= found.path.t_ns[0]) & (times <= found.path.t_ns[-1])])
-    looked = Coverage(held.frame, layer.view, layer.height_m, coverage)
+    looked = Coverage(held.frame, view_of(layer), layer.height_m)
     for x_m, y_m, heading_rad in poses.tolist():
         looked.look(x_m, y_m, heading_rad, None)
     seen, new = _seen(found, held, layer, poses, height_m), _found(found, held, layer, height_m)
@@ -100,5 +99,6 @@ def looks_at(xy_m: F64, poses: F64, layer: LayerParameters) -> I64:
     away = xy_m[:, None] - poses[None, :, :2]
     range_m = np.hypot(away[..., 0], away[..., 1])
     bearing = wrapped(np.arctan2(away[..., 1], away[..., 0]) - poses[None, :, 2])
-    inside = layer.view.inside(range_m, bearing, 0.1 * layer.range_m, 0.1 * layer.view.field_rad)
+    view = view_of(layer)
+    inside = view.inside(range_m, bearing, 0.1 * view.range_m, 0.1 * view.field_rad)
     return np.asarray(inside.sum(axis=1), np.int64)

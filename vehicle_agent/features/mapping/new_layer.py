@@ -31,10 +31,11 @@ from gnd.vehicle_agent.features.mapping.landmarks import (
     tied,
 )
 from gnd.vehicle_agent.features.mapping.lanes import LaneMap, LaneMatcher
-from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
+from gnd.vehicle_agent.features.mapping.sensors import SERIES_CAR, DriveSensors
 from gnd.vehicle_agent.features.mapping.smoothed_path import SmoothedPath
 from gnd.vehicle_agent.features.mapping.strain import Strain, strains
 
+ROUNDS: Final = 6
 _SETTLED_M: Final = 0.01
 """Rounds end when no feature moves by more."""
 
@@ -45,8 +46,7 @@ class MappedFeatures:
 
     known_id: (N,) id of the known feature that it is, 0 = a new one. kinds: N.
     xy_m: (N, 2). cov_m2: (N, 2, 2), of the place in the map frame: the drive's own errors are in it.
-    height_m: (N,) above the vehicle's origin, nan = not told. hits: (N,) measurements.
-    first_ns, last_ns: (N,) of the measurements.
+    height_m: (N,) above the vehicle's origin, nan = unknown. hits: (N,) measurements.
     """
 
     known_id: I64
@@ -55,8 +55,6 @@ class MappedFeatures:
     cov_m2: F64
     height_m: F64
     hits: I64
-    first_ns: I64
-    last_ns: I64
 
     def __len__(self) -> int:
         return len(self.xy_m)
@@ -80,26 +78,28 @@ class NewLayer:
 
 def map_new_layer(
     drive: FeatureDrive,
-    parameters: NewLayerParameters | None = None,
+    sensors: DriveSensors = SERIES_CAR,
     lanes: LaneMap | None = None,
     known: MapFeatures | None = None,
     *,
     trust_known: bool = True,
+    rounds: int = ROUNDS,
 ) -> NewLayer:
     """Map the features of a drive.
 
     Args:
         drive: what was gathered.
-        parameters: None = the defaults.
+        sensors: how exact the vehicle's own are.
         lanes: the HD map's; None = map without HD map (section 3.1).
         known: features of the layer that the map has already.
-        trust_known: known features help to say where the vehicle is (with their covariances). False: they are only
+        trust_known: known features constrain the poses (with their covariances). False: they are only
             recognised, and where the drive has measured them does not depend on where the map has them.
+        rounds: measurements are given to features anew, and the graph is solved, at most so often.
 
     Raises:
         NewLayerError: the drive's positions and motion do not go together.
     """
-    return _Mapping(drive, parameters or NewLayerParameters(), lanes, known or MapFeatures.none(), trust_known).run()
+    return _Mapping(drive, sensors, lanes, known or MapFeatures.none(), trust_known).run(rounds)
 
 
 class _Mapping:
@@ -108,18 +108,18 @@ class _Mapping:
     def __init__(
         self,
         drive: FeatureDrive,
-        parameters: NewLayerParameters,
+        sensors: DriveSensors,
         lanes: LaneMap | None,
         known: MapFeatures,
         trust_known: bool,
         find_new: bool = True,
     ) -> None:
         drive = drive.within_motion()
-        self.drive, self.parameters, self.known, self.trust_known = drive, parameters, known, trust_known
+        self.drive, self.sensors, self.known, self.trust_known = drive, sensors, known, trust_known
         self.find_new = find_new
         self.m = Measurements.of(drive.looks)
-        self.nodes, self.state = DriveNodes.of(drive, parameters).first_state()
-        self.lanes = None if lanes is None else LaneMatcher(lanes, drive.lanes, self.nodes, parameters.lanes)
+        self.nodes, self.state = DriveNodes.of(drive, sensors).first_state()
+        self.lanes = None if lanes is None else LaneMatcher(lanes, drive.lanes, self.nodes)
         self.owner = np.full(len(self.m), NONE, np.int64)
         self.xy_m = known.xy_m
         self.kind = self._known_kinds()
@@ -133,12 +133,12 @@ class _Mapping:
     def sight(self) -> Sight:
         return self.nodes.sight(self.m.t_ns)
 
-    def run(self) -> NewLayer:
+    def run(self, rounds: int) -> NewLayer:
         """Rounds of association, matching and optimisation."""
         if self.lanes is not None:
             self._solve_without_features()
         slack_m = LANDMARK_REVISIT_M
-        for turn in range(self.parameters.rounds):
+        for turn in range(rounds):
             before = self.xy_m
             self._associate(slack_m)
             solution = self._solve()
@@ -156,7 +156,7 @@ class _Mapping:
         """Better first poses: lanes are matched before features are looked for."""
         for _ in range(2):
             problem = self._problem()
-            self.state = solve(problem, self.state, self.parameters).state
+            self.state = solve(problem, self.state, self.sensors).state
             self.nodes = self.nodes.calibrated(self.state.calibration)
 
     def _problem(self, polish: bool = False) -> Problem:
@@ -204,8 +204,8 @@ class _Mapping:
         ties = tied(self.m, self.sight, number[self.owner], self.state.pose, self.xy_m[seen])
         start = State(self.state.pose, self.xy_m[seen], self.state.calibration)
         problem = replace(self._problem(polish), ties=ties, anchors=self._anchors(seen, number))
-        solution = solve(problem, start, self.parameters)
-        self.strains = strains(problem, solution.state, self.nodes.t_ns, self.parameters)
+        solution = solve(problem, start, self.sensors)
+        self.strains = strains(problem, solution.state, self.nodes.t_ns, self.sensors)
         self.state = State(solution.state.pose, np.empty((0, 2)), solution.state.calibration)
         self.nodes = self.nodes.calibrated(solution.state.calibration)
         self.xy_m = self.xy_m.copy()
@@ -247,8 +247,6 @@ class _Mapping:
             solution.landmark_cov(),
             np.array([_height(self.m.height_m[r]) for r in rows]),
             np.array([len(r) for r in rows], np.int64),
-            np.array([self.m.t_ns[r].min() for r in rows], np.int64),
-            np.array([self.m.t_ns[r].max() for r in rows], np.int64),
         )
         path = SmoothedPath(self.nodes.t_ns, solution.state.pose, self.nodes.reckoning)
         return NewLayer(features, path, solution.state.calibration, solution.cost, solution, self.strains)
@@ -258,13 +256,13 @@ _COLUMNS = ("look", "t_ns", "range_m", "bearing_rad", "sigma_range_m", "sigma_be
 
 
 def _height(height_m: F64) -> float:
-    told = height_m[np.isfinite(height_m)]
-    return float(told.mean()) if len(told) else float("nan")
+    known = height_m[np.isfinite(height_m)]
+    return float(known.mean()) if len(known) else float("nan")
 
 
 def localise_with_features(
     drive: FeatureDrive,
-    parameters: NewLayerParameters | None = None,
+    sensors: DriveSensors = SERIES_CAR,
     lanes: LaneMap | None = None,
     known: MapFeatures | None = None,
 ) -> NewLayer:
@@ -273,9 +271,7 @@ def localise_with_features(
     Deleted features are not to be among `known`; features of a new layer are once they are published. Without `known`
     it is localisation by motion, GNSS and lanes alone. Arguments and errors as of `map_new_layer`.
     """
-    return _Mapping(
-        drive, parameters or NewLayerParameters(), lanes, known or MapFeatures.none(), True, find_new=False
-    ).run()
+    return _Mapping(drive, sensors, lanes, known or MapFeatures.none(), True, find_new=False).run(ROUNDS)
 
 
 def lane_map(lanes: Sequence[F64]) -> LaneMap:

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, wrapped
+from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative
+from gnd.vehicle_agent.features.view import wrapped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedPath:
-    """Poses of K keyframes in the map frame and what the wheels say in between.
+    """Poses of K keyframes in the map frame and dead reckoning in between.
 
     t_ns: (K,) increasing. pose: (K, 3) x, y [m], yaw [rad]. reckoning: with the drive's wheel scale and gyro bias.
     """

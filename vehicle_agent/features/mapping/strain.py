@@ -12,9 +12,10 @@ import numpy as np
 from scipy.stats import binom, chi2
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.mapping.dead_reckoning import relative, wrapped
+from gnd.vehicle_agent.features.mapping.dead_reckoning import relative
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, Problem, State
-from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
+from gnd.vehicle_agent.features.mapping.sensors import DriveSensors
+from gnd.vehicle_agent.features.view import wrapped
 
 WINDOW_S: Final = 120.0
 """Stretches of this length are asked: nine time constants of the GNSS's slow error."""
@@ -49,27 +50,27 @@ class Strain:
         return f"{self.what} {self.from_s:.0f} … {self.until_s:.0f} s: {self.value:.3g}, at most {self.gate:.3g}"
 
 
-def strains(problem: Problem, state: State, t_ns: I64, parameters: NewLayerParameters) -> tuple[Strain, ...]:
+def strains(problem: Problem, state: State, t_ns: I64, sensors: DriveSensors) -> tuple[Strain, ...]:
     """Return what contradicts in a solved graph; none: nothing does.
 
     Args:
         problem: its edges.
         state: its optimum.
         t_ns: (K,) times of the keyframes.
-        parameters: that it was made with.
+        sensors: that it was made with.
     """
     t_s = (t_ns - t_ns[0]) * 1e-9
-    found: list[Strain | None] = [_calibration(state, t_s, parameters)]
+    found: list[Strain | None] = [_calibration(state, t_s, sensors)]
     for low in np.arange(0.0, max(float(t_s[-1]), 1e-3), WINDOW_S):
         span = low, min(low + WINDOW_S, float(t_s[-1]))
         inside = (t_s >= span[0]) & (t_s <= span[1])
         found += [_motion(problem, state, inside, span), _ties(problem, state, inside, span)]
-        found += _fixes(problem.fixes, state, span, parameters)
+        found += _fixes(problem.fixes, state, span, sensors)
     return tuple(one for one in found if one is not None and one.value > one.gate)
 
 
-def _calibration(state: State, t_s: F64, parameters: NewLayerParameters) -> Strain:
-    sigma = np.array([parameters.motion.wheel_scale, parameters.motion.gyro_bias_radps])
+def _calibration(state: State, t_s: F64, sensors: DriveSensors) -> Strain:
+    sigma = np.array([sensors.motion.wheel_scale, sensors.motion.gyro_bias_radps])
     value = float(np.square(state.calibration / sigma).sum())
     return Strain("calibration", 0.0, float(t_s[-1]), value, float(chi2.isf(CHANCE, 2)))
 
@@ -87,16 +88,14 @@ def _motion(problem: Problem, state: State, inside: np.ndarray, span: tuple[floa
     return Strain("motion", *span, value, float(chi2.isf(CHANCE, 3 * len(rows))))
 
 
-def _fixes(
-    fixes: FixNodes, state: State, span: tuple[float, float], parameters: NewLayerParameters
-) -> tuple[Strain, ...]:
+def _fixes(fixes: FixNodes, state: State, span: tuple[float, float], sensors: DriveSensors) -> tuple[Strain, ...]:
     """Fix minus pose under the slow and the white error: its mean by generalised least squares (the slow error lasts,
     so a mean of many is not sure), and what is left over as a whole, which jumps show in.
     """
     rows = np.flatnonzero((fixes.t_s >= span[0]) & (fixes.t_s <= span[1]))
     if len(rows) < FEWEST:
         return ()
-    gnss, t_s = parameters.gnss, fixes.t_s[rows]
+    gnss, t_s = sensors.gnss, fixes.t_s[rows]
     slow = gnss.sigma_m**2 * np.exp(-np.abs(t_s[:, None] - t_s) / gnss.correlation_s)
     inverse = np.linalg.inv(slow + np.diag(fixes.variance_m2[rows]))
     off, information = fixes.xy_m[rows] - state.pose[fixes.key[rows], :2], float(inverse.sum())

@@ -215,7 +215,7 @@ def _leans(slices: Slices, label: I64, centre: F64, height: F64, n: I64) -> F64:
 
 
 def _fused(slices: Slices, label: I64, places: F64, count: int) -> tuple[F64, F64, F64]:
-    """Axes (C, 2), their covariances (C, 2, 2), mean direction from the sensors (C, 2): what each scan says, fused.
+    """Axes (C, 2), their covariances (C, 2, 2), mean direction from the sensors (C, 2): fused over scans.
 
     A scan knows the axis along its rays by the mean of its ranges, across them by the place between two rays.
     """

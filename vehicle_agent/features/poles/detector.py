@@ -57,7 +57,7 @@ Mask = NDArray[np.bool_]
 
 LAYER = "poles"
 RAY_HALF_M = 0.1
-"""Rays that pass so near to an axis tell about it."""
+"""Rays that pass so near to an axis are counted for it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -118,7 +118,6 @@ def kinds_of(columns: PoleColumns, seen: PoleSurroundings, top_m: F64) -> tuple[
         columns: C columns.
         seen: what stands around them.
         top_m: (C,) how high each reaches.
-        p: parameters.
     """
     more = seen.counts[:, :, NEAR] > WIDER * seen.counts[:, :, CORE]
     wide = more & _within(np.maximum(columns.top_m - BIN_M, LOWEST_PLATE_M), top_m - 0.5 * BIN_M)

@@ -166,7 +166,6 @@ def ground_around(points_m: F64, centre_m: F64) -> GroundHeights:
     Args:
         points_m: (N, 3) of one scan, or several.
         centre_m: (3,) the vehicle's origin: the road lies there.
-        p: parameters.
     """
     half = ceil((POLE_RANGE_MAX_M + 3.0) / _GROUND_CELL_M)
     side = half * _GROUND_CELL_M
@@ -187,7 +186,6 @@ def slices_of(
         points_m: (N, 3), z up; what is not finite is left out.
         origins_m: (1 or N, 3) starts of the rays.
         ground: under the points.
-        p: parameters.
         number: of the scan in its window.
         pose: how well the scan's own place is known.
     """

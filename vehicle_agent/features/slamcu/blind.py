@@ -1,7 +1,7 @@
 """Where the vehicle is by wheels, gyro and GNSS alone: a Kalman filter that has never seen a feature of the map.
 
-It is what the particles are held against, and where they are looked for when they are lost. What it says can be coarse;
-it cannot be led astray by a sign that was taken for its neighbour. Its state is that of a particle (`Rbpf`).
+The particles are compared with it, and drawn around it when they are lost. Its place can be coarse;
+it cannot be led astray by a sign that was taken for its neighbour. Its state is that of a particle (`ParticleFilter`).
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu import noise
 from gnd.vehicle_agent.features.view import wrapped
 
 X, Y, HEADING, SCALE, BIAS, GNSS_X, GNSS_Y = range(7)
 JUMP: Final = 30.0
-"""Squared Mahalanobis distance of a fix from where it was expected, beyond which it is another reflection and tells
-nothing: χ² of 2 degrees of freedom, one of three million. Without fixes the place grows uncertain, until one fits."""
+"""Squared Mahalanobis distance of a fix from where it was expected, beyond which it is another reflection and is
+left out: χ² of 2 degrees of freedom, one of three million. Without fixes the place grows uncertain, until one fits."""
 MOST_SHARED: Final = 0.95
 """A first pose made of fixes has at most this share of its variance from their slow error."""
 STANDING_MPS: Final = 0.02
@@ -37,20 +37,19 @@ class BlindBelief:
     cov: F64
 
     @classmethod
-    def first(cls, pose: F64, cov: F64, parameters: SlamcuParameters, gnss_sigma_m: float = 0.0) -> "BlindBelief":
+    def first(cls, pose: F64, cov: F64, gnss_sigma_m: float = 0.0) -> "BlindBelief":
         """The belief at the start.
 
         Args:
             pose: (3,) x, y, heading.
             cov: (3, 3) of it.
-            parameters: of motion and GNSS.
             gnss_sigma_m: of the fixes that the pose was made of, whose slow error is in it; 0: made otherwise.
         """
         mean, full = np.zeros(7), np.zeros((7, 7))
         mean[:3], full[:3, :3] = pose, cov
-        full[SCALE, SCALE], full[BIAS, BIAS] = parameters.motion.scale**2, parameters.motion.bias_radps**2
+        full[SCALE, SCALE], full[BIAS, BIAS] = noise.SCALE**2, noise.BIAS_RADPS**2
         if gnss_sigma_m > 0.0:
-            slow = (1.0 - parameters.gnss.white_share) * gnss_sigma_m**2
+            _, slow = noise.gnss_variances_m2(gnss_sigma_m)
             free = np.linalg.inv(np.linalg.inv(cov + 1e-12 * np.eye(3))[:2, :2])  # of the place, the heading known
             shared = min(slow, MOST_SHARED * float(np.linalg.eigvalsh(free)[0]))
             for place, error in ((X, GNSS_X), (Y, GNSS_Y)):
@@ -63,15 +62,13 @@ class BlindFilter:
     """Extended Kalman filter of the vehicle without its map.
 
     Args:
-        parameters: of motion and GNSS.
         belief: at the start; a GNSS error without variance means that no fix has been seen.
 
     Attributes:
         has_fixes: whether a fix has been seen, or the first pose was made of some.
     """
 
-    def __init__(self, parameters: SlamcuParameters, belief: BlindBelief) -> None:
-        self._p = parameters
+    def __init__(self, belief: BlindBelief) -> None:
         self._mean, self._cov = belief.mean.copy(), belief.cov.copy()
         self.has_fixes = float(belief.cov[GNSS_X, GNSS_X]) > 0.0
         self._since = np.zeros(3)  # x, y, heading at the last propagation of the covariance
@@ -107,7 +104,7 @@ class BlindFilter:
         if t_s == 0.0:
             return
         dx, dy, _ = self._mean[:3] - self._since
-        noise, q = self._p.motion, np.zeros((7, 7))
+        q = np.zeros((7, 7))
         F = np.eye(7)
         F[X, HEADING], F[Y, HEADING] = -dy, dx
         F[X, SCALE], F[Y, SCALE] = np.array([dx, dy]) / (1.0 + self._mean[SCALE])
@@ -115,21 +112,20 @@ class BlindFilter:
         c, s = cos(self._mean[HEADING]), sin(self._mean[HEADING])
         # white turns over the way: heading t, and a third of their lever² across, half of it with the heading
         across = np.array([-dy, dx])
-        q[:2, :2] = noise.speed_m**2 * t_s * np.outer([c, s], [c, s])
-        q[:2, :2] += noise.yaw_rad**2 * t_s / 3.0 * np.outer(across, across)
-        q[:2, HEADING] = q[HEADING, :2] = 0.5 * noise.yaw_rad**2 * t_s * across
-        q[HEADING, HEADING] = noise.yaw_rad**2 * t_s
-        q[SCALE, SCALE], q[BIAS, BIAS] = noise.scale_walk**2 * t_s, noise.bias_walk_radps**2 * t_s
+        q[:2, :2] = noise.SPEED_M**2 * t_s * np.outer([c, s], [c, s])
+        q[:2, :2] += noise.YAW_RAD**2 * t_s / 3.0 * np.outer(across, across)
+        q[:2, HEADING] = q[HEADING, :2] = 0.5 * noise.YAW_RAD**2 * t_s * across
+        q[HEADING, HEADING] = noise.YAW_RAD**2 * t_s
+        q[SCALE, SCALE], q[BIAS, BIAS] = noise.SCALE_WALK**2 * t_s, noise.BIAS_WALK_RADPS**2 * t_s
         self._cov, self._F = F @ self._cov @ F.T + q, F @ self._F
         self._since[:] = self._mean[:3]
         self._driven_s = 0.0
 
     def fix(self, xy_m: F64, sigma_m: float, dt_s: float) -> bool:
-        """Take a fix (2,), `dt_s` after the last one; False: it lies so far off that it tells nothing."""
+        """Take a fix (2,), `dt_s` after the last one; False: it lies so far off that it was left out."""
         self._propagate()
-        white = self._p.gnss.white_share * sigma_m**2
-        slow = (1.0 - self._p.gnss.white_share) * sigma_m**2
-        fade = exp(-dt_s / self._p.gnss.correlation_s)
+        white, slow = noise.gnss_variances_m2(sigma_m)
+        fade = exp(-dt_s / noise.GNSS_CORRELATION_S)
         if not self.has_fixes:
             self._cov[[GNSS_X, GNSS_Y], [GNSS_X, GNSS_Y]], self.has_fixes = slow, True
             fade = 1.0

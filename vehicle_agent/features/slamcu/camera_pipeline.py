@@ -4,20 +4,16 @@ The particle filter of wheels, gyro, GNSS and a camera finds the poses (`watched
 some kilometres. So a tile is decided once nothing can change what was concluded about it, or at the end.
 """
 
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.tile import Tile
-from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Detections, DriveItem, GnssFix, MotionSample, ReferencePose
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import AgentConfigError
-from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.errors import BadPose
 from gnd.vehicle_agent.features.layer import FeatureLayer
 from gnd.vehicle_agent.features.layer_parameters import MARGIN_M
@@ -25,21 +21,19 @@ from gnd.vehicle_agent.features.layers import look_of
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, MapFeatures
 from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, first_pose_of
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from gnd.vehicle_agent.features.slamcu.watched import PoseAt, WatchedSlamcu
+from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion
+from gnd.vehicle_agent.features.without_lidar import VehicleWithoutLidar
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
-from gnd.vehicle_agent.pipeline import FeatureTiles, HeldBack, Output
-from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.pipeline import FeatureTiles, Output
 from gnd.vehicle_agent.report.feature_report import FeatureReporter
 from gnd.vehicle_agent.report.reporter import Identity
-from gnd.vehicle_agent.report.sink import NewReports, ReportList, ReportSink
-from gnd.vehicle_agent.result import HealthTimeline
-from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.report.sink import ReportSink
 
 STEP_M: Final = 100.0
 """Tiles left behind are looked for after this much way."""
 EVERY_LOOK: Final = 50
-"""Of the poses that may still be told anew, so many are passed over: a tile near one of them is not left."""
+"""Of the poses that may still change, so many are passed over: a tile near one of them is not left."""
 WINDOW_NS: Final = 10_000_000_000
 """The first pose is made of the measurements of this time: a vehicle that stands for long has turned in it only."""
 TRY_EVERY_NS: Final = 500_000_000
@@ -54,19 +48,18 @@ class _Taken:
     occlusion: Occlusion | None
 
 
-class CameraPipeline:
-    """One drive of one vehicle without LiDAR. Poses are in the map frame: ENU at the tile of the first position.
+class CameraPipeline(VehicleWithoutLidar):
+    """One drive of one vehicle without LiDAR that localises by features.
 
     Args:
         fix: the first position, which lays the map frame.
         parameters: of the feature layer and its reports.
         identity: who reports.
         outbox: where reports go; None: nowhere but into the `Output`.
-        feature_tiles: what the map says of the layer; None: nothing.
+        feature_tiles: the map's tiles of the layer; None: no map.
         seed: of the particles.
 
     Attributes:
-        place, guard, timeline: as of `Pipeline`.
         slamcu: the filter; None until the first pose is known.
 
     Raises:
@@ -88,15 +81,11 @@ class CameraPipeline:
                 "a vehicle that localises by features needs one layer that its camera looks for, not"
                 f" {', '.join(layer.name for layer in layers) or 'none'}"
             )
-        self._parameters, self._layer_parameters, self._seed = parameters, layers[0], seed
-        frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
-        self.place = Place(frame, fix)
-        self.guard, self.timeline = Guard(), HealthTimeline()
-        self.counts: Counter[str] = Counter()
+        super().__init__(fix, outbox, "searching")
+        self._layer_parameters, self._seed = layers[0], seed
         self.slamcu: WatchedSlamcu | None = None
         self._layer: FeatureLayer | None = None
         self._feature_tiles = feature_tiles
-        self._new_reports = NewReports(ReportList() if outbox is None else outbox)
         self._reporter = FeatureReporter(self._new_reports, identity, fix.t_ns, parameters.report.unchanged_m)
         self._before: deque[MotionSample | GnssFix] = deque()
         self._tried_ns = 0
@@ -104,15 +93,14 @@ class CameraPipeline:
         self._looks: deque[_Taken] = deque()  # whose poses are not final
         self._settled = 0  # looks before these
         self._left_m = 0.0
-        self._online: PoseEstimate | None = None
 
     def push(self, item: DriveItem) -> Output:
         """Take the next measurement; items come in time order. One that cannot be used is counted and left out."""
         if isinstance(item, ReferencePose) or not self.guard.admits(item):
-            return self._output(())
+            return self._output()
         if isinstance(item, GnssFix) and not item.sigma_m > 0:
-            self.guard.bad["no-sigma"] += 1  # nothing says what it is worth
-            return self._output(())
+            self.guard.bad["no-sigma"] += 1  # its noise is not known
+            return self._output()
         if self.slamcu is None:
             self._begin(item)
         else:
@@ -124,22 +112,13 @@ class CameraPipeline:
     def finish(self) -> Output:
         """The drive has ended: look into what is in doubt, then decide and report everything."""
         if self.slamcu is None or self._layer is None:
-            return self._output(())
+            return self._output()
         self.slamcu.finish()
         poses = self._cover(self._settled + len(self._looks))
         for change in self._layer.leave_all():
             self._reporter.add(change, self.place.t_ns, self.place.odometer_m)
         self._reporter.report_all(self.place.t_ns)
         return self._output(poses)
-
-    @property
-    def held_back(self) -> HeldBack:
-        """Nothing of voxels is told."""
-        return HeldBack()
-
-    def tile(self, tile_id: TileId) -> Tile | None:  # noqa: ARG002  (a vehicle without a voxel map holds no tile of it)
-        """None: there is no voxel map."""
-        return None
 
     def account(self) -> dict[str, Any]:
         """What the drive came to, as plain values."""
@@ -157,7 +136,7 @@ class CameraPipeline:
     # --- the first pose ---------------------------------------------------------------------------------------------
 
     def _begin(self, item: DriveItem) -> None:
-        """Gather motion and fixes until they tell a first pose."""
+        """Gather motion and fixes until they give a first pose."""
         if not isinstance(item, MotionSample | GnssFix):
             return
         self._before.append(item)
@@ -186,7 +165,7 @@ class CameraPipeline:
         layer = self._layer_parameters
         parameters = SlamcuParameters(detection_confidence=layer.detection_confidence)
         self.slamcu = WatchedSlamcu(parameters, MapFeatures.none(), first.pose, first.cov, self._seed, sigma_m)
-        self._layer = FeatureLayer(layer, CoverageParameters(), self.place.frame, self.slamcu)
+        self._layer = FeatureLayer(layer, self.place.frame, self.slamcu)
         self._motion_ns = first.t_ns
         self._before.clear()
 
@@ -252,25 +231,17 @@ class CameraPipeline:
         return poses
 
     def _cover(self, until: int) -> tuple[PoseEstimate, ...]:
-        """Take the looks up to one as they were at final poses; those of stretches that were given up say nothing."""
+        """Take the looks up to one as they were at final poses; those of stretches that were given up do not count."""
         slamcu, layer = self.slamcu, self._layer
         assert slamcu is not None
         assert layer is not None
         poses = []
         for number in range(self._settled, until):
             taken, at = self._looks.popleft(), slamcu.path[number]
-            given_up = self._given_up(at, slamcu)
+            given_up = any(lost.gives_up(at.t_s, at.t_s) for lost in slamcu.lost)
             if not given_up:
                 layer.cover(at.pose, taken.occlusion)
             health: Health = "lost" if given_up else "good"
             poses.append(self._estimate(taken.t_ns, at.pose, at.cov, health, "wrong_pose" if given_up else "none"))
         self._settled = until
         return tuple(poses)
-
-    def _given_up(self, at: PoseAt, slamcu: WatchedSlamcu) -> bool:
-        return any(not lost.told_anew and lost.from_s <= at.t_s <= lost.until_s for lost in slamcu.lost)
-
-    def _output(self, poses: tuple[PoseEstimate, ...]) -> Output:
-        online = self._online
-        state: tuple[Health, Cause] = ("lost", "searching") if online is None else (online.health, online.cause)
-        return Output(poses, self._new_reports.take(), online, *state)

@@ -43,7 +43,7 @@ def first_pose_of(
         sigma_m: one sigma of each axis of a fix.
 
     Raises:
-        BadPose: too little was driven, or too few fixes came, to tell a heading.
+        BadPose: too little was driven, or too few fixes came, for a heading.
     """
     dt_s = np.diff(motion_ns, prepend=motion_ns[:1]) * 1e-9
     heading = np.cumsum(yaw_rate_radps * dt_s)
@@ -51,7 +51,7 @@ def first_pose_of(
     track = np.column_stack([np.cumsum(step * np.cos(heading)), np.cumsum(step * np.sin(heading)), heading])
     moved_m = hypot(*(track[-1, :2] - track[0, :2])) if len(track) else 0.0
     if len(fix_ns) < LEAST_FIXES or moved_m < LEAST_WAY_M:
-        raise BadPose(f"{moved_m:.1f} m and {len(fix_ns)} fixes tell no heading")
+        raise BadPose(f"{moved_m:.1f} m and {len(fix_ns)} fixes give no heading")
     at = np.column_stack([np.interp(fix_ns, motion_ns, track[:, axis]) for axis in (0, 1)])
     turn, shift = _laid_onto(at, fix_m)
     c, s = np.cos(turn), np.sin(turn)

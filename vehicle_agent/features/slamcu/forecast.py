@@ -7,8 +7,8 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import HEADING
-from gnd.vehicle_agent.features.slamcu.existence_book import BookEntry
-from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
+from gnd.vehicle_agent.features.slamcu.tracked_feature import TrackedFeature
 from gnd.vehicle_agent.features.view import wrapped
 
 
@@ -30,22 +30,22 @@ class Forecast:
         return np.sqrt(np.stack([self.cov[:, 0, 0], self.cov[:, 1, 1]], axis=1))
 
 
-def forecast(rbpf: Rbpf, weights: F64, entries: Sequence[BookEntry]) -> Forecast:
+def forecast(particles: ParticleFilter, weights: F64, features: Sequence[TrackedFeature]) -> Forecast:
     """Predict range and bearing of features.
 
     A feature that is estimated in the particles is predicted from each one's own position of it, so that errors of the
     pose that are in the feature as well do not count.
     """
-    n = len(entries)
+    n = len(features)
     if n == 0:
         return Forecast(np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    places = np.empty((n, 2, rbpf.m))
+    places = np.empty((n, 2, particles.m))
     within = np.empty((n, 3))
-    for i, entry in enumerate(entries):
-        places[i], within[i] = _place(rbpf, weights, entry)
-    d = places - rbpf.state[None, :2]
+    for i, feature in enumerate(features):
+        places[i], within[i] = _place(particles, weights, feature)
+    d = places - particles.state[None, :2]
     range_m = np.hypot(d[:, 0], d[:, 1])
-    bearing = np.arctan2(d[:, 1], d[:, 0]) - rbpf.state[HEADING]
+    bearing = np.arctan2(d[:, 1], d[:, 0]) - particles.state[HEADING]
     z = np.stack([range_m, bearing[:, :1] + wrapped(bearing - bearing[:, :1])])
     mean = z @ weights
     off = z - mean[..., None]
@@ -53,11 +53,11 @@ def forecast(rbpf: Rbpf, weights: F64, entries: Sequence[BookEntry]) -> Forecast
     return Forecast(np.stack([mean[0], wrapped(mean[1])], axis=1), cov)
 
 
-def _place(rbpf: Rbpf, weights: F64, entry: BookEntry) -> tuple[F64, F64]:
+def _place(particles: ParticleFilter, weights: F64, feature: TrackedFeature) -> tuple[F64, F64]:
     """Positions (2, M) or (2, 1), and the covariance (3,) within each particle."""
-    if entry.slot is not None:
-        return rbpf.mu[entry.slot].T, weights @ rbpf.sigma[entry.slot]
-    return entry.xy_m[:, None], np.zeros(3) if entry.cov is None else entry.cov
+    if feature.slot is not None:
+        return particles.mu[feature.slot].T, weights @ particles.sigma[feature.slot]
+    return feature.xy_m[:, None], np.zeros(3) if feature.cov is None else feature.cov
 
 
 def _projected(d: F64, within: F64) -> F64:

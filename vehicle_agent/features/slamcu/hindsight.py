@@ -1,9 +1,9 @@
-"""Where the vehicle was, told afterwards by wheels, gyro and GNSS alone: what came later says of a place, too.
+"""Where the vehicle was, by wheels, gyro and GNSS alone, with the fixes that came later.
 
 The GNSS's slow error hides metres from a filter that looks back only. Fixes of the minutes before and after, tied by
 wheels and gyro, average it: 0.5 m along the road and 1 m across, where the filter (`blind.py`) has 1.6 m. That is
-sure enough to tell a gantry that was read a lane off, though not while it happens. Fixed-interval smoother of Rauch,
-Tung and Striebel (1965), over the steps from fix to fix of the blind filter.
+sure enough to find out, though not while it happens, that a gantry was read a lane off. Fixed-interval smoother of
+Rauch, Tung and Striebel (1965), over the steps from fix to fix of the blind filter.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, BlindFilter
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.noise import GNSS_INTERVAL_S
 
 LASTING_M: Final = 0.5
 """What a GNSS may be off by all the while (ionosphere, the antenna's place), each axis."""
@@ -37,7 +37,7 @@ GATE_SURE: Final = 18.4
 LEAST_S: Final = 2.0
 """A shorter contradiction is none: a sign at the edge of view turns the place for a moment."""
 CORRELATED_S: Final = 20.0
-"""So far apart what hindsight says of two poses is told anew: the GNSS's slow error, and the way between signs."""
+"""So far apart hindsight is independent for two poses: the GNSS's slow error, and the way between signs."""
 MOST_EACH: Final = 15.0
 
 
@@ -73,13 +73,11 @@ class Hindsight:
     """A blind filter that remembers.
 
     Args:
-        parameters: of motion and GNSS.
         first: the belief at the start.
     """
 
-    def __init__(self, parameters: SlamcuParameters, first: BlindBelief) -> None:
-        self._p = parameters
-        self._blind = BlindFilter(parameters, first)
+    def __init__(self, first: BlindBelief) -> None:
+        self._blind = BlindFilter(first)
         self._steps: list[_Step] = []
         self.now_s = 0.0
         self._fix_s: float | None = None
@@ -90,10 +88,9 @@ class Hindsight:
         self.now_s += dt_s
 
     def fix(self, xy_m: F64, sigma_m: float) -> None:
-        """Take a fix (2,); as `Slamcu.gnss`, not more often than fixes tell something new."""
-        interval_s = self._p.gnss.interval_s
-        since_s = interval_s if self._fix_s is None else self.now_s - self._fix_s
-        if since_s + 1e-6 < interval_s:
+        """Take a fix (2,); as `Slamcu.gnss`, not more often than every `GNSS_INTERVAL_S`."""
+        since_s = GNSS_INTERVAL_S if self._fix_s is None else self.now_s - self._fix_s
+        if since_s + 1e-6 < GNSS_INTERVAL_S:
             return
         self._fix_s = self.now_s
         self._blind.fix(xy_m, sigma_m, since_s)
@@ -119,10 +116,10 @@ class Hindsight:
 
 
 def apart_from(t_s: F64, pose: F64, cov: F64, smoothed: Smoothed) -> tuple[F64, F64, F64]:
-    """How far poses are from what hindsight tells of them.
+    """How far poses are from hindsight's.
 
-    The difference is taken at each fix, and told for the poses between and next to fixes: wheels and gyro tell the way
-    of either. Far from any fix nothing is told: 0 off.
+    The difference is taken at each fix, and interpolated for the poses between and next to fixes: wheels and gyro give
+    the way of either. Far from any fix it is 0.
 
     Args:
         t_s: (S,) times, ascending.
@@ -143,8 +140,8 @@ def apart_from(t_s: F64, pose: F64, cov: F64, smoothed: Smoothed) -> tuple[F64, 
     ahead = np.searchsorted(at_s, t_s).clip(0, len(at_s) - 1)
     behind = np.maximum(ahead - 1, 0)
     near = np.where(t_s - at_s[behind] < np.abs(at_s[ahead] - t_s), behind, ahead)
-    is_told = np.abs(at_s[near] - t_s) <= AROUND_S
-    off = np.column_stack([np.interp(t_s, at_s, there[:, axis]) for axis in (0, 1)]) * is_told[:, None]
+    is_near = np.abs(at_s[near] - t_s) <= AROUND_S
+    off = np.column_stack([np.interp(t_s, at_s, there[:, axis]) for axis in (0, 1)]) * is_near[:, None]
     total = total + smoothed.cov[inside][near, :2, :2]
     return off, total, np.einsum("si,si->s", off, np.linalg.solve(total, off[..., None])[..., 0])
 
@@ -170,8 +167,8 @@ def elsewhere(off_m: F64, total_m2: F64) -> F64:
 
 
 def claimed(t_s: F64, pose: F64, cov: F64, smoothed: Smoothed) -> F64:
-    """(S, 3, 3) covariances that hold what the particles say and what hindsight does: the moments of both, mixed, about
-    the pose that is told.
+    """(S, 3, 3) covariances that hold the particles' place and hindsight's: the moments of both, mixed, about the
+    particles' pose.
     """
     if not (len(smoothed) and len(t_s)):
         return held(cov)
@@ -241,7 +238,7 @@ def contradictions(t_s: F64, pose: F64, cov: F64, smoothed: Smoothed, gate: floa
 
 
 def speaks_against(t_s: F64, pose: F64, cov: F64, smoothed: Smoothed) -> float:
-    """What hindsight says against a path, natural logarithm."""
+    """Cost of a path by hindsight, natural logarithm."""
     if not (len(smoothed) and len(t_s)):
         return 0.0
     _, _, squared = apart_from(t_s, pose, cov, smoothed)

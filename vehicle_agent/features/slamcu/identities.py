@@ -1,7 +1,7 @@
 """Which estimate is which feature of the map, decided when all of its measurements are in.
 
-The panels of a gantry stand a lane apart, and one look at 80 m cannot tell them from one another: what is measured at
-first may be taken for its neighbour, and everything after it follows. An estimate gathered over a passage can tell. So
+The panels of a gantry stand a lane apart, and one look at 80 m cannot distinguish them: what is measured at
+first may be taken for its neighbour, and everything after it follows. An estimate gathered over a passage can. So
 before the map's features are settled, all ways to give the estimates at hand to them are compared, by the likelihood of
 the whole in each particle: the pose is the same for all of them.
 """
@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu import measurement
-from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
 
 NONE: Final = -1
 """Of a feature of the map that none of the estimates is."""
@@ -37,32 +37,32 @@ class Identities(NamedTuple):
     """How much likelier than the next way, natural logarithm; inf where there is only one."""
 
 
-def best_identities(rbpf: Rbpf, slots: list[int], owned: int, ln_none: float = LN_NONE) -> Identities:
+def best_identities(particles: ParticleFilter, slots: list[int], owned: int, ln_none: float = LN_NONE) -> Identities:
     """Which of `slots` are the features of the map that own the first ones.
 
     Args:
-        rbpf: the particles; slots that are owned have a prior.
+        particles: the filter; slots that are owned have a prior.
         slots: S slots of one kind near one another, the `owned` ones first.
         owned: J features of the map, J <= S.
         ln_none: of the density of a feature that is none of them, 1/m^2.
     """
-    fit = agreements(rbpf, slots, owned)
-    log_weight = np.log(np.maximum(rbpf.weights(without=set(slots)), 1e-300))
+    fit = agreements(particles, slots, owned)
+    log_weight = np.log(np.maximum(particles.weights(without=set(slots)), 1e-300))
     ways = _ways(fit, log_weight)
-    told = np.array([likelihood(fit, log_weight, way, ln_none) for way in ways])
-    best = int(np.argmax(told))
-    lead = float(told[best] - np.delete(told, best).max(initial=-np.inf))
+    likelihoods = np.array([likelihood(fit, log_weight, way, ln_none) for way in ways])
+    best = int(np.argmax(likelihoods))
+    lead = float(likelihoods[best] - np.delete(likelihoods, best).max(initial=-np.inf))
     return Identities([NONE if i == NONE else slots[i] for i in ways[best]], lead)
 
 
-def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:
+def agreements(particles: ParticleFilter, slots: list[int], owned: int) -> F64:
     """(J, S, M) log likelihood of each prior, were it the slot's."""
-    fit = np.empty((owned, len(slots), rbpf.m))
+    fit = np.empty((owned, len(slots), particles.m))
     for j in range(owned):
-        prior = rbpf.priors[slots[j]]
+        prior = particles.priors[slots[j]]
         assert prior is not None
         for s, slot in enumerate(slots):
-            fit[j, s] = measurement.agreement(rbpf.mu[slot], rbpf.sigma[slot], *prior)
+            fit[j, s] = measurement.agreement(particles.mu[slot], particles.sigma[slot], *prior)
     return fit
 
 

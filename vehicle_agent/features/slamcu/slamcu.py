@@ -1,7 +1,7 @@
 """Simultaneous localisation and map change update: SLAMCU (Jo, Kim and Sunwoo 2018), on one vehicle.
 
 Each look: associate measurements with features, one to one (section 4.3.1); those in view that were not measured lose
-existence, those measured gain it (4.3.2); what is new is registered; what exists tells where the vehicle is (4.3.4, 5).
+existence, those measured gain it (4.3.2); what is new is registered; what exists localises the vehicle (4.3.4, 5).
 """
 
 from collections.abc import Collection
@@ -17,13 +17,15 @@ from gnd.vehicle_agent.features.errors import BadPose
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.association import Association, associate, pair_costs
 from gnd.vehicle_agent.features.slamcu.blind import STANDING_MPS, BlindBelief, BlindFilter
-from gnd.vehicle_agent.features.slamcu.existence_book import BookEntry, ExistenceBook, FeatureClass, existence_of
 from gnd.vehicle_agent.features.slamcu.forecast import Forecast, forecast
 from gnd.vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED
+from gnd.vehicle_agent.features.slamcu.map_comparison import MapComparison, MapInnovation
+from gnd.vehicle_agent.features.slamcu.noise import GNSS_INTERVAL_S
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
-from gnd.vehicle_agent.features.slamcu.tidying import Innovation, Tidying
-from gnd.vehicle_agent.features.slamcu.tracked import Tracked
+from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
+from gnd.vehicle_agent.features.slamcu.track_list import TrackList
+from gnd.vehicle_agent.features.slamcu.track_management import leave, leave_all, leave_oldest, remove_false_and_double
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, TrackedFeature, add_evidence, existence_of
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.view import Occlusion, SensorView, wrapped
 
@@ -37,6 +39,8 @@ _EDGE_M: Final = 1.0
 """The same, in range, at least."""
 _EDGE_RAD: Final = radians(1.0)
 """The same, in bearing, at least."""
+_SETTLE_S: Final = 0.5
+"""A feature has left the view when it was out of it for this time."""
 
 NEAR_M: Final = 30.0
 """Features so much farther than the view's range cannot be what was measured."""
@@ -66,10 +70,10 @@ class Passed:
 
 
 class Slamcu:
-    """One drive.
+    """One drive: the particles, the features in them, and the place by wheels, gyro and GNSS alone.
 
     Args:
-        parameters: of existence, association and filter.
+        parameters: of existence and filter.
         known: the map's features; a 2D frame (ENU), metres.
         pose0: (3,) x, y, heading at the start.
         cov0: (3, 3) its covariance.
@@ -77,7 +81,6 @@ class Slamcu:
         gnss_sigma_m: of the GNSS fixes that the first pose was made of, whose slow error it shares; 0: made otherwise.
 
     Attributes:
-        parameters: of existence, association and filter.
         now_s: time driven.
         odometer_m: way driven.
         z_m: height of the vehicle's origin in the map frame, as of `set_pose`; else 0: heights are those over it.
@@ -97,16 +100,15 @@ class Slamcu:
         seed: int = 0,
         gnss_sigma_m: float = 0.0,
     ) -> None:
-        self._p = self.parameters = parameters
+        self._confidence = parameters.detection_confidence
         pose0, cov0 = checked_pose(pose0, cov0)
-        self._rbpf = Rbpf(parameters, pose0, cov0, np.random.default_rng(seed))
-        belief = BlindBelief.first(pose0, cov0, parameters, gnss_sigma_m)
-        self._blind = BlindFilter(parameters, belief)
+        self._particles = ParticleFilter(parameters.particles, pose0, cov0, np.random.default_rng(seed))
+        belief = BlindBelief.first(pose0, cov0, gnss_sigma_m)
+        self._blind = BlindFilter(belief)
         if gnss_sigma_m > 0.0:
-            self._rbpf.seed(belief)
-        self._book = ExistenceBook(parameters)
-        self._tracked = Tracked(parameters, known, self._rbpf, self._book)
-        self._tidying = Tidying(parameters, self._tracked, self._rbpf, self._book, self._blind)
+            self._particles.seed(belief)
+        self._tracks = TrackList(parameters, known, self._particles)
+        self._comparison = MapComparison(self._tracks, self._blind)
         self.now_s = 0.0
         self.odometer_m = 0.0
         self.hidden = 0
@@ -137,7 +139,7 @@ class Slamcu:
         """Move the particles by what was driven since they moved last: nobody asks them between looks and fixes."""
         dt_s, way_m, turn_rad = self._moved.tolist()
         if dt_s > 0.0:
-            self._rbpf.predict(dt_s, way_m / dt_s, turn_rad / dt_s)
+            self._particles.predict(dt_s, way_m / dt_s, turn_rad / dt_s)
             self._moved = np.zeros(3)
 
     def gnss(self, x_m: float, y_m: float, sigma_m: float) -> bool:
@@ -151,8 +153,8 @@ class Slamcu:
         """
         if not (isfinite(x_m + y_m + sigma_m) and sigma_m > 0.0):
             raise BadPose(f"GNSS fix ({x_m}, {y_m}) m with sigma {sigma_m} m")
-        since_s = self._p.gnss.interval_s if self._gnss_s is None else self.now_s - self._gnss_s
-        if since_s + 1e-6 < self._p.gnss.interval_s:
+        since_s = GNSS_INTERVAL_S if self._gnss_s is None else self.now_s - self._gnss_s
+        if since_s + 1e-6 < GNSS_INTERVAL_S:
             return False
         self._gnss_s = self.now_s
         if not self._blind.fix(np.array([x_m, y_m]), sigma_m, since_s):
@@ -160,9 +162,9 @@ class Slamcu:
             return False
         self._move()
         weighed_s = since_s if self._weighed_s is None else self.now_s - self._weighed_s
-        self._rbpf.gnss(np.array([x_m, y_m]), sigma_m, weighed_s)
+        self._particles.gnss(np.array([x_m, y_m]), sigma_m, weighed_s)
         self._weighed_s = self.now_s
-        self._rbpf.resample_if_needed()
+        self._particles.resample_if_needed()
         return True
 
     def set_pose(self, pose: F64, cov: F64, z_m: float = 0.0) -> None:
@@ -175,13 +177,13 @@ class Slamcu:
         pose, cov = checked_pose(pose, cov)
         self.z_m = z_m
         self._moved = np.zeros(3)
-        self._rbpf.weighing = False
-        self._rbpf.place(pose, cov)
+        self._particles.weighing = False
+        self._particles.place(pose, cov)
 
     def pose(self) -> tuple[F64, F64]:
         """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
         self._move()
-        return self._rbpf.pose(self._rbpf.weights())
+        return self._particles.pose(self._particles.weights())
 
     @property
     def blind(self) -> BlindBelief:
@@ -190,7 +192,7 @@ class Slamcu:
 
     @property
     def has_fixes(self) -> bool:
-        """Whether the GNSS has told anything yet."""
+        """Whether a fix has been used yet."""
         return self._blind.has_fixes
 
     def look_anew(self) -> None:
@@ -198,55 +200,55 @@ class Slamcu:
 
         What is under way with features ends here: those of the map are not settled, new ones stay where they are.
         """
-        self._tidying.let_go()
+        leave_all(self._tracks)
+        self._comparison.forget_moves()
         self._moved = np.zeros(3)
-        self._rbpf.seed(self._blind.belief)
+        self._particles.seed(self._blind.belief)
 
     def widen(self, position_m: float, heading_rad: float) -> None:
-        """The place is in doubt, and nobody can tell a better one: be as uncertain as that from now on."""
+        """The place is in doubt, and no better one is known: be as uncertain as that from now on."""
         self._move()
-        self._rbpf.loosen((), position_m, heading_rad)
+        self._particles.loosen((), position_m, heading_rad)
 
     def doubt_the_map(self, *, doubted: bool = True) -> None:
         """Whether to take it easier that a sign is gone and another stands in its place."""
-        self._tidying.ln_none = LN_NONE_DOUBTED if doubted else LN_NONE
+        self._comparison.ln_none = LN_NONE_DOUBTED if doubted else LN_NONE
 
     def fork(self, seed: int) -> "Slamcu":
         """A copy that goes its own way, with chance of its own."""
         copied = deepcopy(self)
-        copied._rbpf.rng = np.random.default_rng(seed)
+        copied._particles.rng = np.random.default_rng(seed)
         return copied
 
     def last_seen(self, from_s: float, until_s: float) -> list[Passed]:
         """What was last in view after `from_s` and not after `until_s`, and of which there is evidence."""
         return [
-            Passed(entry.number, entry.known, entry.kind, entry.xy_m, self._book.classify(entry))
-            for entry in (*self._tracked.known, *self._tracked.new)
-            if from_s < entry.in_view_s <= until_s and entry.hits + entry.misses and self._decided(entry)
+            Passed(feature.number, feature.known, feature.kind, feature.xy_m, feature.feature_class)
+            for feature in (*self._tracks.known, *self._tracks.new)
+            if from_s < feature.in_view_s <= until_s and feature.hits + feature.misses and self._decided(feature)
         ]
 
     def decide(self) -> None:
-        """The drive has ended: decide what was left open for further signs to tell."""
-        self._tidying.decide(self._looked_ns)
+        """The drive has ended: decide what was left open for further signs."""
+        self._comparison.decide_all(self._looked_ns)
 
-    def _decided(self, entry: BookEntry) -> bool:
-        return entry.slot is None or self._rbpf.provisional[entry.slot]
+    def _decided(self, feature: TrackedFeature) -> bool:
+        return feature.slot is None or self._particles.provisional[feature.slot]
 
-    def told(self) -> list[Innovation]:
-        """How far from their places features of the map were measured that have been settled since the last call."""
-        found, self._tidying.told = self._tidying.told, []
+    def take_innovations(self) -> list[MapInnovation]:
+        """How far from their places features of the map were measured that were compared since the last call."""
+        found, self._comparison.innovations = self._comparison.innovations, []
         return found
 
     def changes(self) -> tuple[int, int]:
         """How many features of the map are called deleted, and how many new ones there are."""
-        classify = self._book.classify
-        deleted = sum(classify(entry) == FeatureClass.DELETED for entry in self._tracked.known)
-        return deleted, sum(classify(entry) == FeatureClass.NEW for entry in self._tracked.new)
+        deleted = sum(feature.feature_class == FeatureClass.DELETED for feature in self._tracks.known)
+        return deleted, sum(feature.feature_class == FeatureClass.NEW for feature in self._tracks.new)
 
     def in_view(self, within_s: float) -> bool:
         """Whether a feature was in view in the last so many seconds."""
-        entries = (*self._tracked.known, *self._tracked.live)
-        return any(entry.in_view_s > self.now_s - within_s for entry in entries)
+        entries = (*self._tracks.known, *self._tracks.live)
+        return any(feature.in_view_s > self.now_s - within_s for feature in entries)
 
     def look(self, look: Look, view: SensorView, occlusion: Occlusion | None = None) -> None:
         """Take what a detector found, or did not find.
@@ -258,18 +260,19 @@ class Slamcu:
         """
         self._move()
         self._looked_ns = look.t_ns
-        weights = self._rbpf.weights()
-        near = self._tracked.within(self._rbpf.state[:2] @ weights, view.range_m + NEAR_M)
-        ahead = forecast(self._rbpf, weights, near)
+        weights = self._particles.weights()
+        near = self._tracks.within(self._particles.state[:2] @ weights, view.range_m + NEAR_M)
+        ahead = forecast(self._particles, weights, near)
         found = self._associate(look, near, ahead)
         detected = [near[i] for i in found.feature]
         missed = self._missed(near, ahead, found.feature, view, occlusion)
-        self._book.evidence(detected, missed, look.t_ns)  # Eq. (5)
-        self._tidying.measured_together(detected)
+        add_evidence(detected, missed, self._confidence, look.t_ns)  # Eq. (5)
+        for feature in detected:
+            feature.together.update(other.key for other in detected if other is not feature)
         self._measure(look, found.measurement, detected, weights)
         self._register(look, found.alone, weights)
-        self._tidying.tidy(self.now_s, self.odometer_m, look.t_ns, near)
-        self._rbpf.resample_if_needed()  # Eq. (20)
+        self._tidy(near, look.t_ns)
+        self._particles.resample_if_needed()  # Eq. (20)
 
     def hold(self, known: MapFeatures) -> None:
         """Further features of the map, such as those of a tile that came.
@@ -277,39 +280,39 @@ class Slamcu:
         Raises:
             BadMapFeatures: one of them is held already.
         """
-        self._tracked.hold(known)
+        self._tracks.hold(known)
 
     def forget(self, feature_ids: Collection[int]) -> None:
         """Features of the map that matter no longer, such as those of a tile that was left."""
-        self._tracked.forget(feature_ids)
+        self._tracks.forget(feature_ids)
 
     def known_states(self) -> tuple[KnownState, ...]:
         """All features of the map, in its order."""
-        return tuple(self._known_state(entry) for entry in self._tracked.known)
+        return tuple(self._known_state(feature) for feature in self._tracks.known)
 
     def new_features(self, *, unclassified: bool = False) -> tuple[NewFeature, ...]:
         """Features that the map has not and that exist; `unclassified`: those with too little evidence as well."""
-        weights = self._rbpf.weights()
-        found = [self._new_feature(entry, weights) for entry in self._tracked.new]
+        weights = self._particles.weights()
+        found = [self._new_feature(feature, weights) for feature in self._tracks.new]
         return tuple(one for one in found if unclassified or one.feature_class == FeatureClass.NEW)
 
-    def _associate(self, look: Look, near: list[BookEntry], ahead: Forecast) -> Association:
+    def _associate(self, look: Look, near: list[TrackedFeature], ahead: Forecast) -> Association:
         """Section 4.3.1, by the likelihood of range and bearing and by how plausible the feature's existence is."""
         z = np.stack([look.range_m, look.bearing_rad], axis=1)
         innovation = z[:, None] - ahead.z[None]
         innovation[..., 1] = wrapped(innovation[..., 1])
         noise = np.zeros((len(look), 1, 2, 2))
         noise[:, 0, [0, 1], [0, 1]] = look.variance
-        same = np.array([[kind == entry.kind for entry in near] for kind in look.kinds], bool).reshape(
+        same = np.array([[kind == feature.kind for feature in near] for kind in look.kinds], bool).reshape(
             len(look), len(near)
         )
         cost = pair_costs(innovation, ahead.cov[None] + noise, same, _GATE)
-        plausible = np.array([max(entry.masses[0] + entry.masses[2], LEAST_PLAUSIBLE) for entry in near])
+        plausible = np.array([max(feature.masses[0] + feature.masses[2], LEAST_PLAUSIBLE) for feature in near])
         return associate(cost - np.log(plausible), -np.log(_NEW_DENSITY))
 
     def _missed(
-        self, near: list[BookEntry], ahead: Forecast, measured: I64, view: SensorView, occlusion: Occlusion | None
-    ) -> list[BookEntry]:
+        self, near: list[TrackedFeature], ahead: Forecast, measured: I64, view: SensorView, occlusion: Occlusion | None
+    ) -> list[TrackedFeature]:
         """Features well in view that nothing hides and that were not measured: they get Eq. (2)."""
         if not near:
             return []
@@ -328,53 +331,65 @@ class Slamcu:
             rows = rows[clear]
         return [near[i] for i in rows]
 
-    def _measure(self, look: Look, rows: I64, detected: list[BookEntry], weights: F64) -> None:
+    def _measure(self, look: Look, rows: I64, detected: list[TrackedFeature], weights: F64) -> None:
         """Section 4.3.4: features that exist are measured; Eq. (16) to (19)."""
-        for row, entry in zip(rows, detected, strict=True):
+        for row, feature in zip(rows, detected, strict=True):
             z, variance = np.array([look.range_m[row], look.bearing_rad[row]]), look.variance[row]
-            exists = self._book.usable(entry)
-            if entry.slot is None and exists:
-                self._tracked.enter(entry, z, variance)
-            elif entry.slot is not None:
-                self._rbpf.measure(entry.slot, z, variance, weigh=exists)
-            self._noted(entry, look, int(row), weights)
+            exists = feature.exists
+            if feature.slot is None and exists:
+                self._tracks.begin(feature, z, variance)
+            elif feature.slot is not None:
+                self._particles.measure(feature.slot, z, variance, weigh=exists)
+            self._noted(feature, look, int(row), weights)
 
     def _register(self, look: Look, rows: I64, weights: F64) -> None:
         """What belongs to nothing known is new; Eq. (4)."""
         for row in rows:
-            entry = self._tracked.register(look.kinds[row])
-            self._tracked.enter(entry, np.array([look.range_m[row], look.bearing_rad[row]]), look.variance[row])
-            entry.hits = 1
-            entry.history.append((look.t_ns, entry.masses))
-            self._noted(entry, look, int(row), weights)
+            feature = self._tracks.register(look.kinds[row])
+            self._tracks.begin(feature, np.array([look.range_m[row], look.bearing_rad[row]]), look.variance[row])
+            feature.hits = 1
+            feature.history.append((look.t_ns, feature.masses))
+            self._noted(feature, look, int(row), weights)
 
-    def _noted(self, entry: BookEntry, look: Look, row: int, weights: F64) -> None:
-        entry.in_view_s, entry.odometer_m = self.now_s, self.odometer_m
-        entry.pass_hits += 1
+    def _noted(self, feature: TrackedFeature, look: Look, row: int, weights: F64) -> None:
+        feature.in_view_s, feature.odometer_m = self.now_s, self.odometer_m
+        feature.pass_hits += 1
         if look.height_m is not None and isfinite(look.height_m[row]):
-            entry.heights.append(float(look.height_m[row]) + self.z_m)
-        if entry.slot is not None and not entry.known:
-            entry.xy_m = weights @ self._rbpf.mu[entry.slot] if entry.cov is None else entry.xy_m
+            feature.heights.append(float(look.height_m[row]) + self.z_m)
+        if feature.slot is not None and not feature.known:
+            feature.xy_m = weights @ self._particles.mu[feature.slot] if feature.cov is None else feature.xy_m
 
-    def _known_state(self, entry: BookEntry) -> KnownState:
-        seen = entry.seen
-        if seen is None and entry.slot is not None and self._rbpf.priors[entry.slot] is not None:
-            seen = self._rbpf.moments(entry.slot, self._rbpf.weights(without=(entry.slot,)))
+    def _tidy(self, near: list[TrackedFeature], t_ns: int) -> None:
+        """Remove false and double features, and settle what has left the view."""
+        remove_false_and_double(self._tracks, near, t_ns)
+        self._comparison.begin_round(self.now_s, self.odometer_m)
+        for feature in list(self._tracks.live):
+            out_of_view = self.now_s - feature.in_view_s > _SETTLE_S
+            if self._tracks.awaits_map(feature):
+                self._comparison.compare_if_due(feature, t_ns, out_of_view=out_of_view)
+            elif feature.slot is not None and out_of_view:
+                leave(self._tracks, feature, self.odometer_m)
+        leave_oldest(self._tracks)
+
+    def _known_state(self, feature: TrackedFeature) -> KnownState:
+        seen = feature.measured
+        if seen is None and self._tracks.awaits_map(feature):
+            seen = self._tracks.moments(feature)
         xy_m, cov = seen if seen is not None else (None, None)
         return KnownState(
-            entry.number, self._book.classify(entry), existence_of(entry.masses), entry.hits, entry.misses,
-            xy_m, cov, entry.height_m, entry.masses_over_time(),
+            feature.number, feature.feature_class, existence_of(feature.masses), feature.hits, feature.misses,
+            xy_m, cov, feature.height_m, feature.masses_over_time(),
         )  # fmt: skip
 
-    def _new_feature(self, entry: BookEntry, weights: F64) -> NewFeature:
-        if entry.slot is not None:
-            xy_m, cov = self._rbpf.moments(entry.slot, weights)
+    def _new_feature(self, feature: TrackedFeature, weights: F64) -> NewFeature:
+        if feature.slot is not None:
+            xy_m, cov = self._particles.moments(feature.slot, weights)
         else:
-            assert entry.cov is not None
-            xy_m, cov = entry.xy_m, entry.cov[[0, 1, 1, 2]].reshape(2, 2)
+            assert feature.cov is not None
+            xy_m, cov = feature.xy_m, feature.cov[[0, 1, 1, 2]].reshape(2, 2)
         return NewFeature(
-            entry.number, entry.kind, xy_m, cov, entry.height_m, self._book.classify(entry),
-            existence_of(entry.masses), entry.hits, entry.misses, entry.masses_over_time(),
+            feature.number, feature.kind, xy_m, cov, feature.height_m, feature.feature_class,
+            existence_of(feature.masses), feature.hits, feature.misses, feature.masses_over_time(),
         )  # fmt: skip
 
 

@@ -1,15 +1,15 @@
-"""What a drive with SLAMCU says of features."""
+"""Verdicts of a drive with SLAMCU on features."""
 
 from dataclasses import dataclass, field
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import Existence
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass, MassesAt
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, MassesAt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownState:
-    """What the drive says of a feature of its map.
+    """Verdict on a feature of the map.
 
     Attributes:
         feature_id: the map's.

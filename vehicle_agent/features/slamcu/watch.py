@@ -2,9 +2,9 @@
 
 Four tests:
 
-- **offset**: the mean of fix minus pose, weighed by how far its neighbours tell the same error once more (the fixes'
+- **offset**: the mean of fix minus pose, weighed by how far its neighbours have the same error (the fixes'
   slow error is a Gauss-Markov process: generalised least squares by its Kalman filter), over two windows;
-- **blind**: the pose against that of wheels, gyro and GNSS alone (`blind.py`), which tells the heading too;
+- **blind**: the pose against that of wheels, gyro and GNSS alone (`blind.py`), which has the heading too;
 - **map**: features of the map that have gone, while one like it stands near by, against those found in place: a
   sequential test (CUSUM) of "lost" against "here";
 - **sign**: how far from its place in the map a feature was measured, in units of what pose and measurement may be off
@@ -19,11 +19,11 @@ from typing import Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu import noise
 from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, apart
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
-from gnd.vehicle_agent.features.slamcu.parameters import GnssNoise
+from gnd.vehicle_agent.features.slamcu.map_comparison import MapInnovation
 from gnd.vehicle_agent.features.slamcu.slamcu import Passed
-from gnd.vehicle_agent.features.slamcu.tidying import Innovation
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 
 WINDOWS_S: Final = (40.0, 160.0)
 """Over these times offsets are averaged: three and twelve time constants of the slow error."""
@@ -52,6 +52,8 @@ that was not while a new one like it stands near by. Here: 0.86, 0.09 and 0.05 o
 GATE_MAP: Final = 4.0
 """Two signs in a row that stand elsewhere."""
 BESIDE_M: Final = 30.0
+PASSED_AROUND_S: Final = 40.0
+"""A feature that stands near by was in view at most so long before."""
 DELETED_COST: Final = 3.0
 NEW_COST: Final = 2.0
 """What a change costs an account of a drive (natural logarithm): few features of a map have gone, few are new."""
@@ -73,18 +75,14 @@ class Alarm:
 
 
 class Watch:
-    """The four tests along one account of a drive.
-
-    Args:
-        noise: of the GNSS.
+    """The four tests along one run of a drive.
 
     Attributes:
-        cost: what fixes and signs say against this account (natural logarithm).
+        cost: of fixes and signs against this run (natural logarithm).
         run: of the map's test, >= 0.
     """
 
-    def __init__(self, noise: GnssNoise) -> None:
-        self._noise = noise
+    def __init__(self) -> None:
         self._error, self._of_one, self._var = np.zeros(2), 0.0, 0.0
         self._sums = np.zeros((len(WINDOWS_S), 4))  # A (2), B, and B of the squared weights
         self._offset = self._blind = 0.0
@@ -102,8 +100,8 @@ class Watch:
             pose: (3,) and covariance (3, 3).
             blind: of wheels, gyro and GNSS alone.
         """
-        white, slow = self._noise.white_share * sigma_m**2, (1.0 - self._noise.white_share) * sigma_m**2
-        fade = exp(-dt_s / self._noise.correlation_s) if self._var else 1.0
+        white, slow = noise.gnss_variances_m2(sigma_m)
+        fade = exp(-dt_s / noise.GNSS_CORRELATION_S) if self._var else 1.0
         var = self._var * fade**2 + (1.0 - fade**2) * slow if self._var else slow
         total, place = var + white, pose[1][:2, :2]
         nu, one = off_m - fade * self._error, 1.0 - fade * self._of_one  # the answer to an offset of one metre
@@ -124,15 +122,15 @@ class Watch:
         """Features that have just left the view, and those (new ones among them) that stand around."""
         for one in seen:
             if one.known:
-                self.run = max(self.run + _told(one, beside), 0.0)
+                self.run = max(self.run + _evidence(one, beside), 0.0)
 
-    def sign(self, told: Innovation) -> None:
+    def sign(self, innovation: MapInnovation) -> None:
         """A feature of the map was measured, and compared with its place."""
-        self._sign = max(self._sign, told.squared)
-        self.cost -= max(told.ln_density, LEAST_LN_DENSITY)
+        self._sign = max(self._sign, innovation.squared)
+        self.cost -= max(innovation.ln_density, LEAST_LN_DENSITY)
 
     def settled(self) -> None:
-        """The doubt has been looked into, and this account is the best there is: one more such sign, and it is asked
+        """The doubt has been looked into, and this run is the best there is: one more such sign, and it is asked
         again.
         """
         self.run = min(self.run, 0.5 * GATE_MAP)
@@ -162,8 +160,8 @@ def _offset(sums: F64, place: F64) -> float:
     return float(off @ np.linalg.solve(cov, off))
 
 
-def _told(one: Passed, around: Sequence[Passed]) -> float:
-    """What a feature of the map says of being lost."""
+def _evidence(one: Passed, around: Sequence[Passed]) -> float:
+    """Log likelihood ratio of lost against here, of a feature of the map."""
     if one.feature_class == FeatureClass.NORMAL:
         return FOUND
     if one.feature_class != FeatureClass.DELETED:

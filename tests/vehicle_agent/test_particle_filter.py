@@ -1,0 +1,246 @@
+"""The particle filter: vectorised steps against plain twins, and against a Kalman filter where one is exact."""
+
+from math import radians
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from particle_filter_plain import ekf, h, log_normal, unpacked
+
+from gnd.vehicle_agent.features.errors import SlamcuParameterError
+from gnd.vehicle_agent.features.slamcu import measurement, noise, particle_filter
+from gnd.vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE, X, Y
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter, effective, systematic
+
+VARIANCE = np.array([1.0, radians(2.5) ** 2])
+
+
+def particles_of(m: int, cov: np.ndarray | None = None, seed: int = 0) -> ParticleFilter:
+    """A filter whose wheels and gyro have no lasting error."""
+    cov = np.diag([0.3, 0.2, 1e-4]) if cov is None else cov
+    made = ParticleFilter(m, np.array([10.0, -4.0, 2.9]), cov, np.random.default_rng(seed))
+    made.state[[SCALE, BIAS]] = 0.0
+    return made
+
+
+@pytest.fixture
+def no_floor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measurements are never another feature's: the textbook's weights."""
+    monkeypatch.setattr(particle_filter, "_FLOOR", 0.0)
+
+
+@pytest.fixture
+def no_resampling(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(particle_filter, "_RESAMPLE_BELOW", 0.0)
+
+
+def covariances(rng: np.random.Generator, m: int) -> np.ndarray:
+    root = rng.normal(0.0, 1.0, (m, 2, 2))
+    full = root @ root.swapaxes(1, 2) + 0.1 * np.eye(2)
+    return full[:, [0, 0, 1], [0, 1, 1]]
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_update_of_all_particles_is_the_textbook_update_of_each(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    m = 7
+    pose = np.stack([rng.normal(0, 5, m), rng.normal(0, 5, m), rng.uniform(-3.2, 3.2, m)])
+    mu = pose[:2].T + rng.uniform(8.0, 60.0, (m, 1)) * np.stack([np.cos(seed + pose[2]), np.sin(seed + pose[2])], 1)
+    sigma = covariances(rng, m)
+    z = h(pose[:, 0], mu[0]) + rng.normal(0.0, 1.0, 2) * np.sqrt(VARIANCE)
+    new_mu, new_sigma, log_likelihood = measurement.update(pose, mu, sigma, z, VARIANCE)
+    for k in range(m):
+        want = ekf(pose[:, k], mu[k], unpacked(sigma[k]), z, np.diag(VARIANCE))
+        assert np.allclose(new_mu[k], want[0], atol=1e-5)
+        assert np.allclose(unpacked(new_sigma[k]), want[1], atol=1e-5)
+        assert np.isclose(log_likelihood[k], want[2], rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.usefixtures("no_floor", "no_resampling")
+def test_a_whole_sequence_agrees_with_a_loop_over_particles() -> None:
+    """Weights, positions and covariances after three measurements, of a filter that may not resample."""
+    particles = particles_of(40)
+    truth, rng = np.array([-20.0, 6.0]), np.random.default_rng(3)
+    poses = particles.state[:3].copy()
+    plain: list[tuple[np.ndarray, np.ndarray, float]] = []
+    for step in range(4):
+        z = h(np.array([10.0, -4.0, 2.9]), truth) + rng.normal(0.0, 1.0, 2) * np.sqrt(VARIANCE)
+        if step == 0:
+            particles.add(z, VARIANCE)
+            plain = [(particles.mu[0, k].copy(), unpacked(particles.sigma[0, k]), 0.0) for k in range(40)]
+            continue
+        particles.measure(0, z, VARIANCE, weigh=True)
+        after = [ekf(poses[:, k], mu, sigma, z, np.diag(VARIANCE)) for k, (mu, sigma, _) in enumerate(plain)]
+        plain = [(*new[:2], old[2] + new[2]) for new, old in zip(after, plain, strict=True)]
+    assert np.allclose(particles.mu[0], [one[0] for one in plain], atol=1e-4)
+    assert np.allclose([unpacked(row) for row in particles.sigma[0]], [one[1] for one in plain], atol=1e-4)
+    assert np.allclose(particles.log_weight, [one[2] for one in plain], atol=1e-3)
+
+
+def test_the_first_measurement_places_a_feature() -> None:
+    particles = particles_of(5)
+    z = np.array([30.0, 0.2])
+    particles.add(z, VARIANCE)
+    for k in range(5):
+        assert np.allclose(h(particles.state[:3, k], particles.mu[0, k]), z)
+        want = ekf(particles.state[:3, k], particles.mu[0, k], 1e9 * np.eye(2), z, np.diag(VARIANCE))
+        assert np.allclose(unpacked(particles.sigma[0, k]), want[1], rtol=1e-3)
+
+
+@pytest.mark.usefixtures("no_floor", "no_resampling")
+def test_settling_is_weighing_with_eq_17_when_the_map_has_no_error() -> None:
+    """Ten measurements of a feature of the map: each weighed by Eq. (17), or compared with the map once, together."""
+    at, rng = np.array([-15.0, 2.0]), np.random.default_rng(9)
+    particles = particles_of(200, cov=np.diag([0.02, 0.02, 1e-5]))
+    variance = np.array([0.2, radians(0.5)]) ** 2
+    want = np.zeros(200)
+    for step in range(10):
+        z = h(np.array([10.0, -4.0, 2.9]), at) + rng.normal(0.0, 1.0, 2) * np.sqrt(variance)
+        want += [log_normal(z - h(particles.state[:3, k], at), np.diag(variance)) for k in range(200)]  # Eq. (17)
+        if step == 0:
+            particles.add(z, variance, (at, np.zeros(3)))
+        else:
+            particles.measure(0, z, variance, weigh=True)
+    provisional = particles.weights()
+    particles.settle(0)
+    weights = np.exp(want - want.max())
+    assert np.allclose(particles.weights(), provisional, atol=1e-4)
+    assert np.allclose(provisional, weights / weights.sum(), atol=2e-3)
+    assert np.abs(particles.mu[0] - at).max() < 1e-9
+    assert np.abs(particles.sigma[0]).max() < 1e-9
+
+
+def test_fusing_is_adding_information() -> None:
+    rng = np.random.default_rng(5)
+    mu, sigma, at, cov = rng.normal(0, 3, (6, 2)), covariances(rng, 6), rng.normal(0, 3, 2), covariances(rng, 1)[0]
+    got_mu, got_sigma = measurement.fused(mu, sigma, at, cov)
+    log = measurement.agreement(mu, sigma, at, cov)
+    for k in range(6):
+        one, other = np.linalg.inv(unpacked(sigma[k])), np.linalg.inv(unpacked(cov))
+        both = np.linalg.inv(one + other)
+        assert np.allclose(unpacked(got_sigma[k]), both)
+        assert np.allclose(got_mu[k], both @ (one @ mu[k] + other @ at))
+        assert np.isclose(log[k], log_normal(mu[k] - at, unpacked(sigma[k]) + unpacked(cov)))
+
+
+def test_moments_are_those_of_the_mixture() -> None:
+    particles = particles_of(50)
+    particles.add(np.array([20.0, 0.1]), VARIANCE)
+    particles.log_weight = np.random.default_rng(1).normal(0.0, 1.0, 50)
+    weights = particles.weights()
+    mean, cov = particles.moments(0, weights)
+    want = sum(w * mu for w, mu in zip(weights, particles.mu[0], strict=True))
+    second = sum(
+        w * (unpacked(s) + np.outer(mu, mu))
+        for w, mu, s in zip(weights, particles.mu[0], particles.sigma[0], strict=True)
+    )
+    assert np.allclose(mean, want)
+    assert np.allclose(cov, second - np.outer(want, want), atol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60))
+@settings(max_examples=50)
+def test_systematic_resampling_takes_each_as_often_as_it_weighs(seed: int, m: int) -> None:
+    rng = np.random.default_rng(seed)
+    weights = rng.random(m) ** 4 + 1e-9
+    weights /= weights.sum()
+    counts = np.bincount(systematic(weights, float(rng.random())), minlength=m)
+    assert counts.sum() == m
+    assert (np.abs(counts - m * weights) < 1.0 + 1e-9).all()
+
+
+def test_effective_number_of_particles() -> None:
+    assert effective(np.full(8, 0.125)) == pytest.approx(8.0)
+    assert effective(np.eye(8)[0]) == pytest.approx(1.0)
+
+
+def test_jitter_keeps_mean_and_covariance_of_poses_and_features_together() -> None:
+    particles = particles_of(20_000, cov=np.array([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 0.01]]))
+    particles.add(np.array([20.0, 0.1]), VARIANCE)
+    together = np.concatenate([particles.state[:3], particles.mu[0].T])
+    mean, cov = together.mean(axis=1), np.cov(together)
+    particles._resample(np.full(particles.m, 1.0 / particles.m))
+    again = np.concatenate([particles.state[:3], particles.mu[0].T])
+    assert not np.isclose(again[0], together[0], atol=1e-3).all()
+    assert np.allclose(again.mean(axis=1), mean, atol=1e-6)
+    assert np.allclose(np.cov(again), cov, rtol=0.02, atol=0.03)
+
+
+def test_gnss_against_a_kalman_filter() -> None:
+    """A standing vehicle: position and the slow error of the GNSS are linear, so the exact posterior is known."""
+    particles = particles_of(20_000, cov=np.diag([4.0, 4.0, 1e-6]), seed=2)
+    rng, sigma = np.random.default_rng(8), 2.0
+    white, slow = noise.gnss_variances_m2(sigma)
+    mean, P = np.array([10.0, 0.0]), np.diag([4.0, slow])
+    H = np.array([[1.0, 1.0]])
+    for step in range(12):
+        fade = np.exp(-5.0 / noise.GNSS_CORRELATION_S) if step else 1.0
+        F = np.diag([1.0, fade])
+        mean, P = F @ mean, F @ P @ F + np.diag([0.0, (1 - fade**2) * slow])
+        fix = np.array([11.0, -4.0]) + rng.normal(0.0, 1.5, 2)
+        S = (H @ P @ H.T).item() + white
+        K = P @ H.T / S
+        mean, P = mean + K[:, 0] * (fix[0] - mean.sum()), P - K @ H @ P
+        particles.gnss(fix, sigma, 5.0 if step else 0.5)
+        particles.resample_if_needed()
+    weights = particles.weights()
+    x = particles.state[X] @ weights
+    assert x == pytest.approx(mean[0], abs=0.15)
+    assert np.sqrt(np.square(particles.state[X] - x) @ weights) == pytest.approx(np.sqrt(P[0, 0]), rel=0.08)
+    assert particles.state[GNSS_X] @ weights == pytest.approx(mean[1], abs=0.15)
+
+
+def test_prediction_turns_and_drives() -> None:
+    """A quarter of a circle of radius 10 m."""
+    particles = particles_of(1, cov=np.zeros((3, 3)))  # one particle has no noise
+    for _ in range(1000):
+        particles.predict(1e-3 * np.pi / 2, 10.0, 1.0)
+    start = np.array([10.0, -4.0])
+    left = np.array([-np.sin(2.9), np.cos(2.9)])
+    ahead = np.array([np.cos(2.9), np.sin(2.9)])
+    assert np.allclose(particles.state[[X, Y], 0], start + 10.0 * ahead + 10.0 * left, atol=1e-3)
+    assert np.allclose(particles.state[HEADING], 2.9 + np.pi / 2)
+
+
+def test_noise_of_prediction_does_not_depend_on_the_rate() -> None:
+    spread = []
+    for steps in (10, 100):
+        particles = ParticleFilter(4000, np.zeros(3), np.zeros((3, 3)), np.random.default_rng(1))
+        for _ in range(steps):
+            particles.predict(4.0 / steps, 20.0, 0.0)
+        spread.append(particles.state[:3].std(axis=1))
+    assert np.allclose(spread[0], spread[1], rtol=0.15)
+
+
+def test_standing_still_nothing_moves() -> None:
+    particles = particles_of(30)
+    before = particles.state.copy()
+    particles.predict(10.0, 0.0, 0.01)
+    assert np.array_equal(particles.state, before)
+
+
+@pytest.mark.usefixtures("no_floor")
+def test_a_likelihood_that_decides_alone_is_taken_in_steps() -> None:
+    """3 m uncertain, measured to 5 cm against the map: the posterior is that of the Kalman filter, not a few copies."""
+    particles = particles_of(2000, cov=np.diag([9.0, 9.0, 1e-8]))
+    at = np.array([-20.0, -4.0])
+    variance = np.array([0.05**2, (0.05 / 30.0) ** 2])
+    particles.add(h(np.array([10.5, -4.3, 2.9]), at), variance, (at, np.full(3, 0.0)))
+    particles.settle(0)
+    weights = particles.weights()
+    pose, cov = particles.pose(weights)
+    assert np.allclose(pose[:2], [10.5, -4.3], atol=0.03)
+    assert np.allclose(np.sqrt(np.diag(cov)[:2]), 0.05, rtol=0.35)
+    assert effective(weights) > 500.0
+
+
+def test_parameters_out_of_range_are_refused() -> None:
+    with pytest.raises(SlamcuParameterError, match="particles = 0"):
+        SlamcuParameters(particles=0)
+    with pytest.raises(SlamcuParameterError, match="detection_confidence = 1"):
+        SlamcuParameters(detection_confidence=1.0)
+    with pytest.raises(SlamcuParameterError, match="map_sigma_m = nan"):
+        SlamcuParameters(map_sigma_m=float("nan"))

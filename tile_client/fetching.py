@@ -1,0 +1,75 @@
+"""Tiles of any region from the tile server, in batches of one district."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Final
+
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import RequestFailed
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.region import Region
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import batch_key, catalog_keys
+from gnd.schemas.tiles import Catalog, CatalogEntry
+from gnd.tile_client.exchange import Exchange, ExchangeOutcome, TilesInMemory
+
+BATCH_BYTES: Final = 1_000_000
+"""Bodies of one answer: large enough that a district comes in a few, small enough for a slow link."""
+_NOTHING_HELD: Final[Mapping[TileId, AnyTile]] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class TileServerClient:
+    """Questions about one layer.
+
+    Attributes:
+        bus: an open bus.
+        layer: name of the layer.
+        timeout_s: how long one question is asked again before it fails.
+    """
+
+    bus: Bus
+    layer: str
+    timeout_s: float
+
+    def catalog(self, region: Region) -> list[CatalogEntry]:
+        """The newest version of each tile of the region, by tile.
+
+        Raises:
+            RequestFailed: nobody answers within `timeout_s`.
+        """
+        keys = catalog_keys(self.layer, region.prefix)
+        replies = self.bus.request_many(keys, b"", kind="catalog", timeout_s=self.timeout_s)
+        entries = (entry for _, payload in replies for entry in Catalog.decode(payload).entries)
+        return sorted((entry for entry in entries if entry.tile in region), key=lambda entry: entry.tile)
+
+    def fetch(self, tiles: Sequence[TileId], held: Mapping[TileId, AnyTile] = _NOTHING_HELD) -> Iterator[AnyTile]:
+        """The newest versions of tiles, by tile; those that the server has not are left out.
+
+        Args:
+            tiles: any tiles, each once.
+            held: what the caller holds of them: only what differs is sent.
+
+        Raises:
+            RequestFailed: no answer, or one that is wrong twice.
+            SchemaError: an answer that is none.
+        """
+        exchange: Exchange[AnyTile] = Exchange(self.bus, TilesInMemory(self.layer, held), self.timeout_s)
+        for _, group in groupby(sorted(tiles), key=lambda tile: tile.district):
+            wanted, whole = list(group), {tile for tile in tiles if tile not in held}
+            while wanted:
+                outcome = exchange.ask(wanted, whole, BATCH_BYTES)
+                self._check(outcome, whole)
+                yield from (one.tile for one in outcome.fetched if one.tile is not None)
+                whole |= outcome.wrong.keys()
+                wanted = sorted([*outcome.later, *outcome.wrong])
+
+    def _check(self, outcome: ExchangeOutcome[AnyTile], whole: set[TileId]) -> None:
+        """`RequestFailed` where a tile was wrong although it came whole, or nothing came at all."""
+        for tile, why in outcome.wrong.items():
+            if tile in whole:
+                raise RequestFailed(batch_key(self.layer, tile.district), 1, why)
+        if not outcome.fetched and not outcome.wrong:
+            why = f"none of {len(outcome.later)} tiles came"
+            raise RequestFailed(batch_key(self.layer, outcome.later[0].district), 1, why)

@@ -1,0 +1,133 @@
+"""Captures of a Velodyne's packets (pcap): decoded by `velodyne-decoder`, with the times of the packets.
+
+VLP-16, Puck Hi-Res, VLP-32C, HDL-32E and HDL-64E S2/S3 are known by their packets. The first and last turn are cut off
+by the capture and are left out. Positions in a capture (GPRMC) have no height, so a place must be given. Packets of
+other sensors are refused with what to do.
+"""
+
+import weakref
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.choices import Choices
+from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.optional import library
+from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
+
+EXTRA: Final = "import"
+MAGICS: Final = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
+VELODYNE_BYTES: Final = 1206
+FULL: Final = 0.8
+"""A turn with less than this share of the usual points was cut off by the capture."""
+_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("offset", "<u4"), ("ring", "<u2")])
+_ADVICE: Final = (
+    "Ouster: `ouster-cli source FILE.pcap save BAG` (ouster-sdk in an environment of its own); other sensors: replay it"
+    " through the sensor's ROS 2 driver; then import the bag of its points"
+)
+
+
+def is_pcap(head: bytes) -> bool:
+    """Whether a file that begins so is a capture."""
+    return head.startswith(MAGICS)
+
+
+def open_pcap(path: Path, anchor: RecordingAnchor | None, choices: Choices | None = None) -> Recording:
+    """A capture; `anchor` says where on the Earth the first pose lies.
+
+    Raises:
+        ImportDriveError: no packets of a Velodyne, or a damaged file.
+        MissingExtra: velodyne-decoder is not installed.
+    """
+    del choices
+    sizes = _sizes(path)
+    if VELODYNE_BYTES not in sizes:
+        held = ", ".join(f"{n} of {size} bytes" for size, n in sorted(sizes.items(), key=lambda one: -one[1])[:4])
+        raise ImportDriveError(
+            f"{path}: no packets of a Velodyne ({VELODYNE_BYTES} bytes) but {held or 'none'}. {_ADVICE}"
+        )
+    store = _Turns(path)
+    t_ns = np.array([begin for begin, _, _ in store.index], np.int64)
+    left_out = (f"{store.left_out} turns cut off by the capture: left out",) if store.left_out else ()
+    others = tuple(
+        Entry(f"{size} bytes", "UDP packets", n, "", "", "positions without a height" if size == 512 else "")
+        for size, n in sizes.items() if size != VELODYNE_BYTES
+    )  # fmt: skip
+    return Recording(
+        name=path.stem,
+        sensor_model=store.model,
+        source=f"packets of {path.name}, decoded by velodyne-decoder",
+        T_vehicle_lidar=np.eye(4),
+        t_ns=t_ns,
+        read=store.read,
+        anchor=anchor or NOMINAL,
+        mount="assumed",
+        placed=anchor is not None,
+        notes=left_out,
+        entries=(
+            Entry(f"{VELODYNE_BYTES} bytes", "data packets", sizes[VELODYNE_BYTES], store.model, "scans"),
+            *others,
+        ),
+    )
+
+
+def _sizes(path: Path) -> dict[int, int]:
+    """How many UDP payloads of each size a capture holds."""
+    util = library("velodyne_decoder.util", EXTRA)
+    sizes: dict[int, int] = {}
+    try:
+        for _, data in util.iter_pcap(str(path)):
+            sizes[len(data)] = sizes.get(len(data), 0) + 1
+    except Exception as error:
+        if not sizes:
+            raise ImportDriveError(f"{path}: no readable capture: {' '.join(str(error).split())[:200]}") from error
+    return sizes
+
+
+class _Turns:
+    """Turns of the sensor, decoded once into a file of their own: a capture can only be read from its beginning."""
+
+    def __init__(self, path: Path) -> None:
+        self.index: list[tuple[int, int, int]] = []
+        self.model, self.left_out = "unknown", 0
+        self._file: IO[bytes] = TemporaryFile()  # noqa: SIM115  (closed when the recording is no longer used)
+        weakref.finalize(self, self._file.close)
+        self._decode(path)
+        usual = float(np.median([n for _, _, n in self.index])) if self.index else 0.0
+        whole = [one for one in self.index if one[2] >= FULL * usual]
+        self.left_out, self.index = len(self.index) - len(whole), whole
+
+    def _decode(self, path: Path) -> None:
+        decoder = library("velodyne_decoder", EXTRA)
+        config = decoder.Config()
+        try:
+            for stamp, points in decoder.read_pcap(str(path), config, as_pcl_structs=True):
+                self._add(stamp.device if stamp.device > 1e8 else stamp.host, points)
+        except Exception as error:
+            if not self.index:
+                raise ImportDriveError(f"{path}: {' '.join(str(error).split())[:200]}") from error
+        self.model = str(config.model).rpartition(".")[2] if config.model is not None else "Velodyne"
+
+    def _add(self, stamp_s: float, points: NDArray[Any]) -> None:
+        if not len(points):
+            return
+        time_s = points["time"].astype(np.float64)
+        out = np.zeros(len(points), _POINT)
+        for name in ("x", "y", "z", "ring"):
+            out[name] = points[name]
+        out["offset"] = np.round((time_s - time_s.min()) * 1e9)
+        begin_ns = round(stamp_s * 1e9) + round(float(time_s.min()) * 1e9)
+        self.index.append((begin_ns, self._file.tell(), len(points)))
+        self._file.write(out.tobytes())
+
+    def read(self, number: int) -> RawScan:
+        """Turn `number` of those that are whole."""
+        begin_ns, at, n = self.index[number]
+        self._file.seek(at)
+        rows = np.frombuffer(self._file.read(n * _POINT.itemsize), _POINT)
+        xyz = np.stack([rows["x"], rows["y"], rows["z"]], axis=1)
+        return RawScan(begin_ns, np.ascontiguousarray(xyz), rows["offset"].copy(), rows["ring"].copy())
