@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.se3 import T_inverse, log_so3, transform
 from gnd.vehicle_agent.map_align.candidates import Reach, candidates
 from gnd.vehicle_agent.map_align.cloud import GaussianCloud
@@ -187,7 +188,7 @@ def align_clouds(a: GaussianCloud, b: GaussianCloud, reach: Reach, progress: Pro
     return result
 
 
-def _within(a: GaussianCloud, b: GaussianCloud, distance_m: float) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+def _within(a: GaussianCloud, b: GaussianCloud, distance_m: float) -> NDArray[np.bool_]:
     """(N,) which of B lie within a horizontal distance of anything of A."""
     return np.asarray(a.plan_tree.query(b.mean_m[:, :2], distance_upper_bound=distance_m)[0] < distance_m)
 
@@ -308,7 +309,9 @@ def _judged(
     )  # fmt: skip
 
 
-def _blocks(a: GaussianCloud, moved: GaussianCloud, row: F64, across_m: F64, matched: F64) -> tuple[Block, ...]:
+def _blocks(
+    a: GaussianCloud, moved: GaussianCloud, row: I64, across_m: F64, matched: NDArray[np.bool_]
+) -> tuple[Block, ...]:
     """The overlap in squares of 15 m, those in which enough surfaces meet."""
     cell = np.floor(moved.mean_m[row, :2] / _BLOCK_M).astype(np.int64)
     found = list[Block]()

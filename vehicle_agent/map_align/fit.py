@@ -159,7 +159,7 @@ def lay_onto(a: GaussianCloud, b: GaussianCloud, T_start: F64, scales_m: tuple[f
             prior = np.array([1.0, 1.0]) / _TILT_PRIOR_RAD**2
             H[:2, :2] += np.diag(prior)
             g[:2] += prior * tilt
-            step = -np.linalg.solve(H + 1e-6 * np.eye(6), g)
+            step = np.asarray(-np.linalg.solve(H + 1e-6 * np.eye(6), g), np.float64)
             T = _stepped(T, step, centre)
             if np.abs(step[:3]).max() < _STOP / 10 and np.abs(step[3:]).max() < _STOP:
                 break
