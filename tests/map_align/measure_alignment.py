@@ -12,6 +12,8 @@ import numpy as np
 
 from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from gnd.fleet_sim.street import StreetOptions, street
+from gnd.fleet_sim.trajectory import Direction
+from gnd.fleet_sim.world import State
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.se3 import T_inverse, exp_so3
@@ -41,11 +43,12 @@ def tiles_of(drive: Path) -> tuple[Tile, ...]:
 def drives_of(seed: int, folder: Path, length_m: float = 130.0) -> list[Path]:
     """Two drives of a street, written unless they are there."""
     world, paths = street(seed, StreetOptions(length_m=length_m)), list[Path]()
-    for k, state in enumerate(("before", "after")):
+    passes: tuple[tuple[State, Direction], ...] = (("before", 1), ("after", -1))
+    for k, (state, direction) in enumerate(passes):
         paths.append(folder / f"{seed}-{k}.mcap")
         if not paths[-1].exists():
             config = DriveConfig(
-                "car", "VLP-16", state, seed=seed + k, direction=1 - 2 * k, cruise_mps=12.0, errors=PERFECT
+                "car", "VLP-16", state, seed=seed + k, direction=direction, cruise_mps=12.0, errors=PERFECT
             )
             simulate_drive(world, config, paths[-1])
     return paths

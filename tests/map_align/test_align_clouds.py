@@ -27,12 +27,12 @@ def wall(rng: np.random.Generator, start: tuple[float, float], end: tuple[float,
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     part = rng.uniform(0, 1, (int(150 * length * high_m), 1))
     flat = np.array(start) * (1 - part) + np.array(end) * part
-    return np.c_[flat, rng.uniform(0, high_m, len(part))]
+    return np.asarray(np.c_[flat, rng.uniform(0, high_m, len(part))])
 
 
 def road(rng: np.random.Generator, half_width_m: float = 7.0) -> F64:
     n = int(100 * 4 * HALF_M * half_width_m)
-    return np.c_[rng.uniform(-HALF_M, HALF_M, n), rng.uniform(-half_width_m, half_width_m, n), np.zeros(n)]
+    return np.asarray(np.c_[rng.uniform(-HALF_M, HALF_M, n), rng.uniform(-half_width_m, half_width_m, n), np.zeros(n)])
 
 
 def town(seed: int) -> tuple[list[tuple[float, float, float]], list[tuple[float, float]]]:
