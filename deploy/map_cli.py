@@ -15,6 +15,7 @@ from gnd.tile_store import tables
 from gnd.tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
 from gnd.tile_store.cli import map_group as store_group
 from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
+from gnd.vehicle_agent.map_align.command import align
 
 CODEC_HELP: Final = "How finely Gaussians are rounded."
 REFINE_HELP: Final = (
@@ -111,6 +112,6 @@ def _bars() -> Progress:
 _COMMANDS = {**store_group.commands, "rollback": rollback, "export": export, "diff": diff}
 map_group = click.Group(
     "map",
-    commands=[build, verify, memory, *_COMMANDS.values()],
-    help="Build, inspect, compare, export, verify and roll back maps.",
+    commands=[build, align, verify, memory, *_COMMANDS.values()],
+    help="Build, align, inspect, compare, export, verify and roll back maps.",
 )

@@ -1,0 +1,99 @@
+"""`gnd map align`: a thin command over the library."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import tables
+from gnd.tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
+from gnd.tile_store.options import bars
+from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
+
+REFUSED = 1
+
+
+@click.command(short_help="Lay a map or drive onto another map.")
+@click.argument("a", type=PATH)
+@click.argument("b", type=PATH)
+@click.option("--out", "-o", type=PATH, help="Write B, moved onto A: a drive or a new store, as B is.")
+@click.option("--within", "shift_m", default=10.0, show_default=True, type=click.FloatRange(1, 50), help="Search [m].")
+@click.option("--turn", "turn_deg", default=5.0, show_default=True, type=click.FloatRange(0.1, 20), help="Search [°].")
+@click.option("--picture", type=PATH, help="Draw both from above, before and after (PNG).")
+@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help="Of --out.")
+@layer_option
+@json_option
+@click.pass_context
+def align(
+    context: click.Context, a: Path, b: Path, out: Path | None, shift_m: float, turn_deg: float, picture: Path | None,
+    codec: str, layer: str, as_json: bool,
+) -> None:  # fmt: skip
+    """Find where B lies on A, both a map (store) or a drive (MCAP), from where their GNSS puts them.
+
+    A stays. Exit status 1, and nothing is written, when B does not fit: too little overlap, more than one place,
+    residuals too high, or B is bent against A.
+    """
+    # loaded here: they load numba, scipy and matplotlib, which the other commands do without
+    from gnd.vehicle_agent.map_align.align import align_clouds
+    from gnd.vehicle_agent.map_align.candidates import Reach
+    from gnd.vehicle_agent.map_align.cloud import cloud_of_tiles
+    from gnd.vehicle_agent.map_align.move import moved_drive, moved_tiles
+    from gnd.vehicle_agent.map_align.sources import AlignError, open_side
+
+    if out is not None and out.exists():
+        raise AlignError(f"{out} exists; --out writes a new file")
+    with bars() as progress:
+        sides = [open_side(path, layer, progress) for path in (a, b)]
+        frame = LocalFrame.of_tile(middle_tile([tile.tile_id for tile in sides[1].tiles]))
+        cloud_a, cloud_b = (cloud_of_tiles(side.tiles, frame) for side in sides)
+        found = align_clouds(cloud_a, cloud_b, Reach(shift_m, turn_deg, max(shift_m, 5.0)), progress)
+    if picture is not None:
+        from gnd.vehicle_agent.map_align.picture import draw_alignment
+
+        draw_alignment(cloud_a, cloud_b, found, picture)
+    if out is not None and found.fits:
+        if sides[1].kind == "drive":
+            moved_drive(b, out, frame, found.T_a_b, f"moved onto {a.name} by gnd map align: {_motion(found)}")
+        else:
+            tiles = moved_tiles(sides[1], frame, found.T_a_b, codec)
+            with store_to_fill(out) as store:
+                store.put_tiles(tiles, layer=layer, surveyed_ns=sides[1].surveyed_ns)
+    values = {"a": str(a), "b": str(b), "frame": {"lat_rad": frame.lat_rad, "lon_rad": frame.lon_rad}}
+    values |= found.as_dict() | {"written": str(out) if out is not None and found.fits else None}
+    show(values, as_json, lambda console: _print(console, values))
+    if not found.fits:
+        context.exit(REFUSED)
+
+
+def middle_tile(tiles: list[TileId]) -> TileId:
+    """The tile nearest to the middle of all, by its indices."""
+    east = sorted(tile.lon_index for tile in tiles)[len(tiles) // 2]
+    north = sorted(tile.lat_index for tile in tiles)[len(tiles) // 2]
+    return TileId.from_indices(east, north)
+
+
+def _motion(found: Any) -> str:
+    east, north, up = found.shift_m.tolist()
+    return f"{east:.3f} m east, {north:.3f} m north, {up:.3f} m up, {found.rotation_deg[2]:.4f} degrees left"
+
+
+def _print(console: Console, values: dict[str, Any]) -> None:
+    shift, sigma, overlap = values["shift_m"], values["sigma_m"], values["overlap"]
+    share, residual = values["matched_share"], values["residual_m"]
+    plain = {name: f"{shift[name]:.3f} m, sigma {100 * sigma[name]:.1f} cm" for name in ("east", "north", "up")} | {
+        "heading": f"{values['heading_deg']:.3f} degrees",
+        "tilt": f"{values['tilt_deg']['about_east']:.3f}, {values['tilt_deg']['about_north']:.3f} degrees",
+        "overlap": f"{overlap['area_m2']:.0f} m2, {overlap['upright']} upright and {overlap['level']} level surfaces",
+        "matched": f"{100 * share['upright']:.0f} % of the upright, {100 * share['level']:.0f} % of the level ones",
+        "residual": f"{100 * residual['p50']:.1f} cm (median), {100 * residual['p90']:.1f} cm (p90)",
+        "second best place": f"{100 * values['second_best']['worth']:.0f} % of the best",
+        "parts off their place": f"at most {100 * values['bend_m']:.1f} cm in 85 % of {len(values['blocks'])} blocks",
+    }
+    console.print(tables.fields(f"{values['b']} on {values['a']}", plain))
+    for reason in values["reasons"]:
+        console.print(f"does not fit: {reason}", style="red", highlight=False)
+    if values["fits"]:
+        console.print("fits" + (f", written: {values['written']}" if values["written"] else ""), highlight=False)
