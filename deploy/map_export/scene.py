@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -17,7 +17,9 @@ from gnd.gnd_map.tile import Tile, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.export import region_frame, region_tiles
 from gnd.tile_store.store import Store
-from gnd.vehicle_agent.way import Milestone, read_way
+
+if TYPE_CHECKING:
+    from gnd.vehicle_agent.way import Milestone
 
 RGB: Final = {kind: tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5)) for kind, colour in CLASS_COLOURS.items()}
 """The colours of the classes of changes, 0 ... 255."""
@@ -58,7 +60,7 @@ class Scene:
     points_m: F32
     count: "np.ndarray[tuple[int], np.dtype[np.int32]]"
     updates: tuple[Update, ...]
-    ways: dict[str, list[Milestone]]
+    ways: "dict[str, list[Milestone]]"
 
     @property
     def start_ns(self) -> int:
@@ -91,7 +93,9 @@ def read_scene(store: Store, layer: str, prefix: str, run: Path | None = None) -
     )
 
 
-def _ways(run: Path) -> dict[str, list[Milestone]]:
+def _ways(run: Path) -> "dict[str, list[Milestone]]":
+    from gnd.vehicle_agent.way import read_way  # it loads what only the extra `vehicle` brings
+
     folder = RunFolder(run)
     names = sorted(path.name for path in folder.agents.iterdir()) if folder.agents.is_dir() else []
     found = {name: list(read_way(folder.way(name))) for name in names}
