@@ -18,6 +18,10 @@ from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.feature_layer import LayerParameters, checked_layers
 from gnd.tile_store.values import DEFAULT_CODEC, StoreConfig, lattice_named
 
+MAX_ATTEMPTS: Final = 5
+"""A tile whose merge fails so often is set aside; so is an upload that cannot be read so often."""
+RETRY_S: Final = 0.5
+"""Pause before a failed tile or upload is tried again, times the number of attempts."""
 _SHARD_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -48,7 +52,6 @@ class ShardConfig:
         'How finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all '
         "shards of a store use the same. Other tiles stay as fine as their base.",
     )
-    expanders: int = setting(2, "Threads that look at what was acknowledged.", least=1)
     lease_s: float = setting(
         10.0,
         "How long a claim holds that nobody renews: its shard has died or hangs.",
@@ -60,17 +63,6 @@ class ShardConfig:
         "How often to look for tiles and notices when nothing arrives here.",
         unit="s",
         above=0,
-    )
-    max_attempts: int = setting(
-        5,
-        "A tile whose merge fails so often is set aside; so is an upload that cannot be read so often.",
-        least=1,
-    )
-    retry_s: float = setting(
-        0.5,
-        "Pause before a failed tile or upload is tried again, times the number of attempts.",
-        unit="s",
-        least=0,
     )
 
     def __post_init__(self) -> None:

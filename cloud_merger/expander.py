@@ -15,7 +15,7 @@ from typing import Final
 from ulid import ULID
 
 from gnd.cloud_merger.checking import MapCheck
-from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.errors import BadReport, MergerError, NotUnderstood
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.ingest import one_line
@@ -107,8 +107,8 @@ class Expander:
             raise
         except Exception as error:  # one upload never stops the others
             _LOG.exception("upload %s failed, attempt %d", claim.upload.report_id, claim.attempts)
-            if claim.attempts < self._config.max_attempts:
-                self._store.postpone_upload(claim, self._config.retry_s * claim.attempts)
+            if claim.attempts < MAX_ATTEMPTS:
+                self._store.postpone_upload(claim, RETRY_S * claim.attempts)
                 return
             outcome = self._settled(self._set_aside(claim, f"{type(error).__name__}: {error}"))
         if outcome is not None:
@@ -144,7 +144,7 @@ class Expander:
                 self._districts.popitem(last=False)
 
     def _understood(self, claim: UploadClaim) -> _Outcome:
-        if claim.attempts > self._config.max_attempts:  # it may be what killed the workers that claimed it before
+        if claim.attempts > MAX_ATTEMPTS:  # it may be what killed the workers that claimed it before
             return self._set_aside(claim, "no worker that claimed it came to an end")
         try:
             return self._outcome(claim)

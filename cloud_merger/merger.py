@@ -35,6 +35,8 @@ ANNOUNCE_AT_ONCE: Final = 256
 TILES_AT_ONCE: Final = 16
 """Tiles that are claimed together; each is published as soon as it is merged."""
 ANNOUNCE_EVERY_S: Final = 0.05
+_EXPANDERS: Final = 2
+"""Threads that look at what was acknowledged."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -99,7 +101,7 @@ def run_worker(
         # tiles that wait for longer than the pause between two looks are found in time without being woken for
         on_journaled = wake.set if config.store.merge_delay_s <= config.poll_s else lambda: None
         expander = Expander(store, config, States(store, bus).tell, on_journaled=on_journaled, bases=bases)
-        stack.enter_context(working(expander.work, arrived, config.expanders, config.poll_s))
+        stack.enter_context(working(expander.work, arrived, _EXPANDERS, config.poll_s))
 
         worker, announcer = Worker(store, config, bases), Announcer(store, bus, members, bases)
         while not stop.is_set():

@@ -7,6 +7,7 @@ flag without its Gaussian is a vote already.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +33,15 @@ from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 
+WANT_SHARE: Final = 0.8
+"""All that could agree with a Gaussian, itself included, must hold more than this share of ξ of the votes; below 1
+because votes that come later may lift it over ξ."""
+
 
 @dataclass(frozen=True, slots=True)
 class WantParameters:
     """When a flagged voxel's Gaussian is asked for."""
 
-    share: float = setting(
-        0.8,
-        "All that could agree with it, itself included, must hold more than this share of ξ of the votes; "
-        "below 1 because votes that come later may lift it over ξ.",
-        least=0,
-        most=1,
-    )
     enough: int = setting(
         4,
         "So many measured Gaussians that may agree with it are enough; 0: none is ever asked for.",
@@ -127,7 +125,7 @@ def _wanted_of_tile(
         votes, cast, in_hand = votes + remembered[0], cast + remembered[1], in_hand + remembered[2]
     votes, cast, in_hand = votes + own.weight, cast + own.weight, in_hand + _promised(known.promised, ids)
     xi = np.where(modified & (merge.mode == "default"), MERGE_XI_RESHAPED, merge.xi)
-    may_win = votes > want.share * xi * cast
+    may_win = votes > WANT_SHARE * xi * cast
     asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
     return may_win, np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
 

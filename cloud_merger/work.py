@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final, TypeVar
 
 from gnd.cloud_merger.belief import ShiftTests, courses_of
-from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.features.kept import FeatureContents, said_of
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
 from gnd.cloud_merger.map_parameters import text_of
@@ -49,7 +49,7 @@ class Worker:
         self._begun: dict[Claim, bool] = {}  # whether the lease was still held
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
-        """What to publish for these claims; a tile that failed is postponed, or set aside after `max_attempts`."""
+        """What to publish for these claims; a tile that failed is postponed, or set aside after `MAX_ATTEMPTS`."""
         attempted = [self._attempt(claim) for claim in claims]
         return [publication for publication in attempted if publication is not None]
 
@@ -97,7 +97,7 @@ class Worker:
         if not is_held:
             return None  # another shard has it
         # It may be what killed the shards that merged it before.
-        if claim.attempts > self._config.max_attempts and not claim.is_retry:
+        if claim.attempts > MAX_ATTEMPTS and not claim.is_retry:
             self._set_aside(claim, "no shard that merged it came to an end")
             return None
         try:
@@ -114,10 +114,10 @@ class Worker:
     def _failed(self, claim: Claim, error: Exception) -> None:
         """Try again later, not for ever."""
         _LOG.error("merge of %s failed, attempt %d", claim.tile, claim.attempts, exc_info=error)
-        if claim.attempts >= self._config.max_attempts:
+        if claim.attempts >= MAX_ATTEMPTS:
             self._set_aside(claim, f"{type(error).__name__}: {error}")
         else:
-            self._store.postpone(claim, self._config.retry_s * claim.attempts)
+            self._store.postpone(claim, RETRY_S * claim.attempts)
 
     def _of_gaussians(self, work: TileWork) -> Publication:
         """Of a tile of the voxel map."""

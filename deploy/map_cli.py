@@ -7,6 +7,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from gnd.deploy.map_export.command import diff, export
 from gnd.deploy.tile_memory_cli import memory
 from gnd.deploy.vehicle_rollback_cli import rollback
 from gnd.deploy.verify_cli import verify
@@ -108,7 +109,7 @@ def _bars() -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
 
 
-_COMMANDS = {**store_group.commands, "rollback": rollback}
+_COMMANDS = {**store_group.commands, "rollback": rollback, "export": export, "diff": diff}
 map_group = click.Group(
     "map",
     commands=[build, align, verify, memory, *_COMMANDS.values()],

@@ -189,7 +189,7 @@ def play_plain(
 
 
 @click.command(name="play")
-@click.argument("recording", type=click.Path(exists=True, path_type=Path))
+@click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--ros2", "on", flag_value="ros2", help="On topics of ROS 2 over rmw_zenoh.")
 @click.option("--zenoh", "on", flag_value="zenoh", help="On plain keys: a drive of ours with all that it holds.")
 @click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Router; repeatable.")
@@ -226,6 +226,8 @@ def messages_of(recording: Path) -> Iterator[Played]:
         ImportDriveError: it is neither.
         DriveError: a drive that is damaged.
     """
+    if not recording.exists():
+        raise ImportDriveError(f"no recording at {recording}")
     try:
         header = read_header(recording)
     except DriveError:

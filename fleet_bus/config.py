@@ -12,6 +12,11 @@ from gnd.fleet_bus.links import LinkProfile, load_link
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+"""Limit of every message, in both directions."""
+QUEUE_LIMIT: Final = 4096
+"""How many received messages may wait for a handler, before some are refused or dropped."""
+MAX_SESSIONS: Final = 10_000
+"""How many sessions a router accepts."""
 READS: Final = ("gnd/v1/tile/**", "gnd/v1/tiles/**", "gnd/v1/catalog/**")
 """Keys of questions that change nothing: whose link is full loses the answer, and asks again."""
 QUEUED_BATCHES: Final = 16
@@ -45,9 +50,6 @@ class BusConfig:
         open_timeout_s: how long `open_bus` tries to reach a router, s.
         patient: whether `open_bus` returns without a router, too, and looks for one as long as it takes: what is
             declared until then is declared when it is found, requests wait for it.
-        max_message_bytes: limit for every message, both directions, bytes.
-        max_sessions: how many sessions a router accepts.
-        queue_limit: how many received messages may wait for a handler, before some are refused or dropped.
     """
 
     mode: Literal["client", "router"] = "client"
@@ -57,9 +59,6 @@ class BusConfig:
     lease_ms: int = 0
     open_timeout_s: float = 10.0
     patient: bool = False
-    max_message_bytes: int = MAX_MESSAGE_BYTES
-    max_sessions: int = 10_000
-    queue_limit: int = 4096
 
     def __post_init__(self) -> None:
         if self.mode not in ("client", "router"):
@@ -74,8 +73,6 @@ class BusConfig:
             check_endpoint(endpoint)
         if self.lease_ms != 0 and self.lease_ms < 100:
             raise BusConfigError(f"lease_ms must be 100 or more (or 0: the link's own), got {self.lease_ms}")
-        if min(self.max_message_bytes, self.max_sessions, self.queue_limit) < 1:
-            raise BusConfigError("max_message_bytes, max_sessions and queue_limit must be positive")
 
     @property
     def link_profile(self) -> LinkProfile:
@@ -190,7 +187,7 @@ def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "scouting/delay": 0,
         # On by default; would carry messages past the socket and past the traffic account.
         "transport/shared_memory/enabled": False,
-        "transport/unicast/max_sessions": config.max_sessions,
+        "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/unicast/accept_pending": 1000,
         "transport/unicast/open_timeout": max(100, min(10_000, round(1000 * config.open_timeout_s))),
         # Has no fragmentation.
@@ -198,5 +195,5 @@ def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/link/tx/lease": config.lease_ms or (ROUTER_LEASE_MS if is_router else link.lease_ms),
         "transport/link/tx/keep_alive": _ROUTER_KEEP_ALIVES if is_router else link.keep_alives,
         "transport/link/tx/batch_size": link.batch_bytes,
-        "transport/link/rx/max_message_size": config.max_message_bytes,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
     }

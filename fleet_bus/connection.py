@@ -11,7 +11,7 @@ from typing import Final, Self
 
 import zenoh
 
-from gnd.fleet_bus.config import BusConfig, zenoh_config
+from gnd.fleet_bus.config import MAX_MESSAGE_BYTES, BusConfig, zenoh_config
 from gnd.fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter, PortInUse
 from gnd.fleet_bus.ledger import Ledger, Share, SharesOf
 from gnd.fleet_bus.pacer import Pacer
@@ -141,9 +141,8 @@ class Connection:
             BusClosed: closed before or while waiting.
         """
         self.check_open()
-        if len(payload) > self.config.max_message_bytes:
-            limit = self.config.max_message_bytes
-            raise MessageTooLarge(f"a {kind} message has {len(payload)} bytes, more than max_message_bytes {limit}")
+        if len(payload) > MAX_MESSAGE_BYTES:
+            raise MessageTooLarge(f"a {kind} message has {len(payload)} bytes, the limit is {MAX_MESSAGE_BYTES}")
         self._pacer.wait("up", len(payload))
         if self.ledger is not None:
             self.ledger.record("up", kind, len(payload), tile, head_bytes=head_bytes)

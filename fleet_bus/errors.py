@@ -41,7 +41,7 @@ class BusClosed(BusError):
 
 
 class MessageTooLarge(BusError):
-    """A payload exceeds `BusConfig.max_message_bytes`; the receiving session would drop it in silence."""
+    """A payload exceeds `MAX_MESSAGE_BYTES`; the receiving session would drop it in silence."""
 
 
 class LedgerError(BusError):

@@ -16,6 +16,7 @@ import zenoh
 from zenoh import ext
 
 from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.errors import BusConfigError, NoRouter
 from gnd.fleet_bus.part import Part
@@ -306,7 +307,7 @@ class RosSubscription(Part):
         super().__init__()
         self.topic, self.dropped, self.lost = topic, 0, 0
         self._newest: dict[bytes, int] = {}
-        limit = qos.depth or connection.config.queue_limit
+        limit = qos.depth or QUEUE_LIMIT
         self._workers: Workers[RosMessage] = Workers(f"ros2 {topic.name}", callback, 1, limit)
         if qos.latched:
             self.declare(

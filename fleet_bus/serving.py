@@ -7,6 +7,7 @@ from typing import Final
 
 import zenoh
 
+from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
 from gnd.fleet_bus.errors import BusClosed, BusError, NotMine, Refused
@@ -69,7 +70,7 @@ class Serving(Part):
         self._connection, self._handler, self._kind = connection, handler, kind
         self._own: list[Workers[_Asked]] = []
         if beside is None:
-            self._own.append(Workers(f"serve {keyexpr}", _answer, workers, connection.config.queue_limit))
+            self._own.append(Workers(f"serve {keyexpr}", _answer, workers, QUEUE_LIMIT))
         self._workers: Workers[_Asked] = self._own[0] if beside is None else beside._workers
         self._regions = self._workers
         if "*" in keyexpr:

@@ -7,6 +7,7 @@ from typing import Any, Final
 import zenoh
 from zenoh import ext
 
+from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.envelopes import NOTICE_BYTES, head_bytes
 from gnd.fleet_bus.errors import BusClosed, NoRouter
@@ -43,8 +44,7 @@ class Subscription(Part):
         self.dropped = 0
         self._connection, self._callback, self._kind = connection, callback, kind
         self._tile_of = tile_of if tile_of is not None else lambda _key: None
-        limit = connection.config.queue_limit
-        self._workers: Workers[zenoh.Sample] = Workers(f"subscribe {keyexpr}", self._deliver, 1, limit)
+        self._workers: Workers[zenoh.Sample] = Workers(f"subscribe {keyexpr}", self._deliver, 1, QUEUE_LIMIT)
         self.declare(connection, lambda session: _declare(session, keyexpr, self._accept, history=history))
 
     def _end(self) -> None:

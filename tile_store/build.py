@@ -50,24 +50,11 @@ _MAX_GAP_S: Final = 1.0
 """Longer gaps between poses are refused, unless the vehicle stands."""
 _STANDING_M: Final = 0.5
 """A vehicle that moved less in a gap stands."""
-
-
-@dataclass(frozen=True, slots=True)
-class BuildParameters:
-    """Which points are used, and what a track of poses may do."""
-
-    min_range_m: float = 2.0
-    """Nearer points are the vehicle itself."""
-    max_range_m: float = 80.0
-    """Farther points are blurred by the heading's error: 0.1 degrees are 14 cm at 80 m."""
-    max_gnss_offset_m: float = 30.0
-    """Median horizontal distance of poses from GNSS fixes (or five sigma, if larger); beyond, the anchor is wrong."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.min_range_m < self.max_range_m:
-            raise BuildError(f"range from {self.min_range_m} m to {self.max_range_m} m is empty")
-        if not self.max_gnss_offset_m > 0:
-            raise BuildError(f"max_gnss_offset_m must be positive, got {self.max_gnss_offset_m}")
+_MAX_GNSS_OFFSET_M: Final = 30.0
+"""Median horizontal distance of poses from GNSS fixes (or five sigma, if larger); beyond, the anchor is wrong."""
+POINT_RANGE_M: Final = (2.0, 80.0)
+"""Nearer points are the vehicle itself; farther ones are blurred by the heading's error: 0.1 degrees are 14 cm at
+80 m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +93,6 @@ def build_map(
     layer: str = DEFAULT_LAYER,
     codec: str = DEFAULT_CODEC,
     n_min_cells: int = N_MIN_CELLS,
-    parameters: BuildParameters | None = None,
     progress: Progress | None = None,
 ) -> BuildResult:
     """Build the tiles that the drives measured and put them into the store as a new base, all or none.
@@ -119,7 +105,6 @@ def build_map(
         layer: such as "ndt"; its name begins so, or it would hold features.
         codec: one of `MAP_CODECS`: the lattice on which the published Gaussians lie, or "float" = as measured.
         n_min_cells: a voxel holds a Gaussian from so many occupied sub-cells on.
-        parameters: which points and poses are used.
         progress: called after each scan.
 
     Raises:
@@ -127,13 +112,12 @@ def build_map(
         DriveError: a drive cannot be read.
         StoreError: an unknown codec, or the store cannot take the tiles.
     """
-    parameters = parameters or BuildParameters()
     lattice = map_lattice(layer, codec)
-    sources = drive_sources(drives, parameters)
-    measured = MapPoints(sources, parameters)
+    sources = drive_sources(drives)
+    measured = MapPoints(sources)
     used, skipped, points = 0, 0, 0
     for source in sources:
-        for points_map_m in _swept(source, parameters, progress):
+        for points_map_m in _swept(source, progress):
             if points_map_m is None:
                 skipped += 1
                 continue
@@ -175,8 +159,8 @@ def surveyed_ns(sources: Sequence[MapSource]) -> int:
 class MapPoints:
     """The points of a build in their voxels, each in its zone of latitude."""
 
-    def __init__(self, sources: Sequence[MapSource], parameters: BuildParameters) -> None:
-        self.accumulators = tuple(_accumulators(sources, parameters))
+    def __init__(self, sources: Sequence[MapSource]) -> None:
+        self.accumulators = tuple(_accumulators(sources))
 
     def add(self, points_map_m: F64) -> None:
         """Take points (N, 3) in the map frame of the build."""
@@ -192,7 +176,7 @@ class MapPoints:
         return _tiles(self.accumulators, n_min_cells, lattice)
 
 
-def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[MapSource]:
+def drive_sources(drives: Sequence[Path]) -> list[MapSource]:
     """The drives with checked poses, all in the map frame of the first.
 
     Raises:
@@ -202,14 +186,14 @@ def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[M
     if not drives:
         raise BuildError("no drives to build a map from")
     anchor = read_header(drives[0]).anchor
-    return [_source(Path(drive), anchor, parameters) for drive in drives]
+    return [_source(Path(drive), anchor) for drive in drives]
 
 
-def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> MapSource:
+def _source(path: Path, anchor: LocalFrame) -> MapSource:
     header, track = read_header(path), load_track(path)
     header.check_placed()
     check_poses(path, track.reference)
-    _check_gnss(path, header.anchor, track.reference, track.gnss, parameters)
+    _check_gnss(path, header.anchor, track.reference, track.gnss)
     T_map_vehicle = anchor.T_self_other(header.anchor) @ track.reference.T_map_vehicle
     poses = Trajectory(track.reference.t_ns, T_map_vehicle)
     T_map_drive = anchor.T_self_other(header.anchor)
@@ -244,9 +228,7 @@ def _refuse(path: Path, what: str, bad: "np.ndarray[tuple[int], np.dtype[np.bool
         )
 
 
-def _check_gnss(
-    path: Path, anchor: LocalFrame, reference: ReferenceTrack, gnss: GnssTrack, parameters: BuildParameters
-) -> None:
+def _check_gnss(path: Path, anchor: LocalFrame, reference: ReferenceTrack, gnss: GnssTrack) -> None:
     """Refuse poses that lie elsewhere than the drive's own GNSS fixes: a wrong anchor moves a whole map unnoticed."""
     inside = (gnss.t_ns >= reference.t_ns[0]) & (gnss.t_ns <= reference.t_ns[-1])
     if not inside.any():
@@ -254,7 +236,7 @@ def _check_gnss(
     fixes_map_m = anchor.enu_from_geodetic(*(column[inside] for column in gnss[1:4]))
     T = Trajectory(*reference).at(gnss.t_ns[inside])
     offset_m = float(np.median(np.linalg.norm((fixes_map_m - T[:, :3, 3])[:, :2], axis=1)))
-    allowed_m = max(parameters.max_gnss_offset_m, 5.0 * float(np.median(gnss.sigma_m[inside])))
+    allowed_m = max(_MAX_GNSS_OFFSET_M, 5.0 * float(np.median(gnss.sigma_m[inside])))
     if offset_m > allowed_m:
         raise BuildError(
             f"{path}: reference poses lie {offset_m:.1f} m from {inside.sum()} GNSS fixes (median), allowed are "
@@ -262,35 +244,35 @@ def _check_gnss(
         )
 
 
-def _accumulators(sources: Sequence[MapSource], parameters: BuildParameters) -> list[VoxelAccumulator]:
+def _accumulators(sources: Sequence[MapSource]) -> list[VoxelAccumulator]:
     """One for each zone of latitude that points may fall into."""
     frame = sources[0].header.anchor
-    groups = zones(_reachable_tiles(frame, sources, parameters.max_range_m))
+    groups = zones(_reachable_tiles(frame, sources))
     return [VoxelAccumulator(GridFrame.around(frame, tiles)) for tiles in groups.values()]
 
 
-def _reachable_tiles(frame: LocalFrame, sources: Sequence[MapSource], max_range_m: float) -> set[TileId]:
+def _reachable_tiles(frame: LocalFrame, sources: Sequence[MapSource]) -> set[TileId]:
     found: set[TileId] = set()
     for source in sources:
         lat, lon, _ = frame.geodetic_from_enu(source.poses.T_dst_vehicle[:, :3, 3])
-        found.update(covering_corridor(lat, lon, max_range_m + _TILE_M))
+        found.update(covering_corridor(lat, lon, POINT_RANGE_M[1] + _TILE_M))
     return found
 
 
-def _swept(source: MapSource, parameters: BuildParameters, progress: Progress | None) -> Iterator[F64 | None]:
+def _swept(source: MapSource, progress: Progress | None) -> Iterator[F64 | None]:
     """Points (N, 3) in the map frame of each scan; None for a scan that the poses do not cover."""
     done = 0
     for item in read_drive(source.path):
         if isinstance(item, Scan):
-            yield _points_map_m(item, source, parameters)
+            yield _points_map_m(item, source)
             done += 1
             if progress:
                 progress(source.path, done, source.scans)
 
 
-def _points_map_m(scan: Scan, source: MapSource, parameters: BuildParameters) -> F64 | None:
+def _points_map_m(scan: Scan, source: MapSource) -> F64 | None:
     range_m = np.linalg.norm(scan.points_m, axis=1)
-    kept = (range_m >= parameters.min_range_m) & (range_m <= parameters.max_range_m)
+    kept = (range_m >= POINT_RANGE_M[0]) & (range_m <= POINT_RANGE_M[1])
     points_m, offset_ns = scan.points_m[kept], scan.t_offset_ns[kept]
     try:
         points_vehicle_m = deskew(

@@ -23,16 +23,14 @@ from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import check_settings, setting, settings_text
 from gnd.schemas.feature_layer import LayerParameters, checked_layers
 from gnd.tile_store import tables, upkeep_cli
-from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
-from gnd.tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
+from gnd.tile_store.arguments import parse_tile
+from gnd.tile_store.compare import layer_info, layer_totals
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.export import FORMATS, export_map
 from gnd.tile_store.metrics import StoreCollector, store_checks
 from gnd.tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.status import status
-from gnd.tile_store.store import Store
 
 __all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", "show", "store", "store_to_fill"]
 
@@ -126,56 +124,6 @@ def info(path: Path, deep: bool, region: str, layer: str, as_json: bool) -> None
     show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
 
 
-@map_group.command(short_help="Write a map as PCD, PLY or GeoJSON.")
-@click.argument("path", metavar="STORE", type=PATH)
-@click.argument("out", metavar="FILE", type=PATH)
-@region_option
-@layer_option
-@click.option("--format", "kind", type=click.Choice(list(FORMATS)), help="  [default: by the file's ending]")
-@json_option
-def export(path: Path, out: Path, region: str, layer: str, kind: str | None, as_json: bool) -> None:
-    """Write the newest tiles of STORE to FILE: Gaussians as PCD or PLY, tiles as GeoJSON."""
-    with to_read(path) as opened:
-        result = export_map(opened, layer, region, out, kind)
-    values = asdict(result) | {"path": str(result.path)}
-    line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
-    show(values, as_json, lambda console: console.print(line, highlight=False))
-
-
-@map_group.command(short_help="Where two maps, times or versions differ.")
-@click.argument("old", metavar="STORE", type=PATH)
-@click.argument("new", metavar="[OTHER]", type=PATH, required=False)
-@click.option("--since", help="Compare with STORE as it was then: 2026-01-31T12:00:00Z.")
-@click.option("--tile", help="Compare two versions of one tile (path, number, or lat,lon) ...")
-@click.option("--versions", help="... these two: 3..5.  [default: the newest with the one before]")
-@region_option
-@layer_option
-@json_option
-def diff(
-    old: Path,
-    new: Path | None,
-    since: str | None,
-    tile: str | None,
-    versions: str | None,
-    region: str,
-    layer: str,
-    as_json: bool,
-) -> None:
-    """Where STORE differs from OTHER, from itself at an earlier time, or between two versions of a tile."""
-    if sum(way is not None for way in (new, since, tile)) != 1 or (versions and not tile):
-        raise StoreError("diff: give either OTHER, --since TIME, or --tile TILE [--versions A..B]")
-    with ExitStack() as stack:
-        first = stack.enter_context(to_read(old))
-        if tile is not None:
-            result = _version_diff(first, layer, tile, versions)
-        elif since is not None:
-            result = map_diff(first, first, layer=layer, prefix=region, old_at_ns=parse_time_ns(since))
-        else:
-            assert new is not None
-            result = map_diff(first, stack.enter_context(to_read(new)), layer=layer, prefix=region)
-    show(result.as_dict(), as_json, lambda console: tables.print_diff(console, result))
-
-
 @map_group.command(short_help="A tile's versions and their reports.")
 @click.argument("path", metavar="STORE", type=PATH)
 @click.argument("tile")
@@ -221,16 +169,6 @@ def _save(files: dict[str, bytes], folder: Path) -> None:
             (folder / name).write_bytes(body)
     except OSError as error:
         raise StoreError(f"{folder}: cannot write: {error.strerror}") from None
-
-
-def _version_diff(store: Store, layer: str, tile: str, versions: str | None) -> MapDiff:
-    tile_id = parse_tile(tile)
-    if versions is not None:
-        return version_diff(store, layer, tile_id, *parse_versions(versions))
-    lines = store.history(layer, tile_id)
-    if len(lines) < 2:
-        raise StoreError(f"tile {tile_id.path} of layer {layer} has {len(lines)} versions; two are needed")
-    return version_diff(store, layer, tile_id, lines[-2].version, lines[-1].version)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from typing import IO, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from gnd.gnd_map.day import UNKNOWN_DAY, ns_of
 from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.gaussian import six_entries
 from gnd.gnd_map.geodesy import LocalFrame
@@ -31,11 +32,15 @@ POINT_TYPE: Final = np.dtype(
         ("voxel_id", "<i4"),
         ("tile_high", "<u4"),
         ("tile_low", "<u4"),
+        ("day", "<i4"),
     ]
 )
-"""One exported Gaussian: mean [m], covariance [m^2], points, occupied sub-cells, voxel id, Morton code of the tile."""
+"""One exported Gaussian: mean [m], covariance [m^2], points, occupied sub-cells, voxel id, Morton code of the tile, and
+when the world was last seen so: days since 1970-01-01 UTC, 0: unknown.
+"""
 
 Points = npt.NDArray[np.void]
+_NS_PER_DAY: Final = 86_400_000_000_000
 
 
 class ExportError(StoreError):
@@ -70,7 +75,7 @@ def export_map(store: Store, layer: str, prefix: str, path: Path | str, format: 
     if name not in FORMATS:
         raise ExportError(f"unknown export format {name!r}; known are {', '.join(FORMATS)}")
     tiles = region_tiles(store, layer, prefix)
-    _write_whole(target, lambda stream: FORMATS[name](stream, tiles))
+    write_whole(target, lambda stream: FORMATS[name](stream, tiles))
     return TilesExported(target, len(tiles), sum(len(tile.gaussians) for tile in tiles), target.stat().st_size)
 
 
@@ -110,6 +115,7 @@ def points_of(tile: Tile, frame: LocalFrame) -> Points:
         points[name] = column
     for name, column in zip(POINT_TYPE.names[3:9], six_entries(R @ gaussians.full_cov() @ R.T).T, strict=True):  # type: ignore[index]
         points[name] = column
+    points["day"] = 0 if tile.day == UNKNOWN_DAY else ns_of(tile.day) // _NS_PER_DAY
     points["count"], points["cells"], points["voxel_id"] = gaussians.count, gaussians.cells, gaussians.voxel_id
     points["tile_high"], points["tile_low"] = divmod(tile.tile_id.morton, 2**32)
     return points
@@ -203,7 +209,7 @@ FORMATS: Final[Mapping[str, Callable[[IO[bytes], list[Tile]], None]]] = {
 }
 
 
-def _write_whole(target: Path, write: Callable[[IO[bytes]], None]) -> None:
+def write_whole(target: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write beside the target and rename at the end, so that no half file ever has its name."""
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:

@@ -19,6 +19,8 @@ from gnd.tile_store.values import Basis, ClosedWindow, ReportRow, StoreConfig, S
 
 NO_WINDOWS: Final = 0
 """The window of reports that are older than the journal of their layer."""
+WINDOW_VEHICLES: Final = 32
+"""A window with votes of so many vehicles takes no report of another."""
 _NS_PER_S: Final = 1_000_000_000
 
 
@@ -61,7 +63,7 @@ def _is_full(c: apsw.Connection, place: dict[str, Any], window: int, vehicle: st
     close a window by talking; the bound on reports only limits the work of one merge.
     """
     reports, vehicles, is_known = fetch(c, "window_size", place | {"window": window, "vehicle": vehicle})[0]
-    return reports >= config.window_reports or (vehicles >= config.window_vehicles and not is_known)
+    return reports >= config.window_reports or (vehicles >= WINDOW_VEHICLES and not is_known)
 
 
 def put(c: apsw.Connection, layer: str, tile: TileId, entry: JournalEntry) -> None:

@@ -100,10 +100,9 @@ class StoreConfig:
         unit="s",
         above=0,
     )
-    window_vehicles: int = setting(32, "... or one of another vehicle when so many have a vote in it ...", least=1)
     window_reports: int = setting(
         96,
-        "... or any when it holds so many: what one merge has to read stays bounded.",
+        "... or when it holds so many: what one merge has to read stays bounded.",
         least=1,
     )
     quarantine_mb: float = setting(

@@ -39,7 +39,6 @@ class DownloadParameters:
     )
     in_flight: int = setting(8, "Requests at a time; one at a time leaves a 5G link at 15 %.", least=1, most=64)
     request_s: float = setting(20.0, "Time for one request, its retries included.", unit="s", above=0)
-    retry_s: float = setting(1.0, "Pause after a request that failed.", unit="s", least=0)
     wait_s: float = setting(
         30.0,
         "A drive that is not paced waits this long for a tile that is near; then it goes on without.",
@@ -64,23 +63,10 @@ class DownloadParameters:
 class ReportParameters:
     """When a tile is left, when a report is sent, which poses may make statements."""
 
-    soon_voxels: int = setting(
-        48,
-        "Where so many voxels of one tile have changed, a report is due at once. On ground that has not changed,"
-        " detection errs in up to some 30.",
-        least=1,
-    )
-    apart_s: float = setting(
-        3.0,
-        "Such reports follow each other no faster than this.",
-        unit="s",
-        least=0,
-    )
     longest_m: float = setting(400.0, "Any change is reported at the latest after this much way ...", unit="m", least=0)
     longest_s: float = setting(
         40.0,
-        "... or time; at least `apart_s`. Such a report costs 0.3 to 0.5 kB with its answers: 20 s at 40 km/h would be"
-        " 2 kB/km.",
+        "... or time. Such a report costs 0.3 to 0.5 kB with its answers: 20 s at 40 km/h would be 2 kB/km.",
         unit="s",
         least=0,
     )
@@ -117,9 +103,8 @@ class ReportParameters:
     def __post_init__(self) -> None:
         """A protocol that there is, and waiting times in order."""
         check_settings(self, AgentConfigError)
-        waits_s = (self.apart_s, self.longest_s, self.unchanged_s)
-        if sorted(waits_s) != list(waits_s):
-            raise AgentConfigError(f"apart_s, longest_s and unchanged_s = {waits_s} s must rise")
+        if self.longest_s > self.unchanged_s:
+            raise AgentConfigError(f"longest_s = {self.longest_s}, unchanged_s = {self.unchanged_s} s must rise")
         if self.longest_m > self.unchanged_m:
             raise AgentConfigError(f"longest_m = {self.longest_m}, unchanged_m = {self.unchanged_m} m must rise")
         if self.protocol not in ("packed", "full"):
@@ -141,7 +126,7 @@ class LiveParameters:
     imu: str = setting("", "Topic of a gyro that gives the yaw rate instead; empty: none.")
     vehicle_frame: str = setting("", "Frame of the vehicle, x forward; empty: base_footprint, base_link, ...")
     mount: tuple[float, ...] = setting(
-        (), "x, y, z (m), roll, pitch, yaw (deg) of the LiDAR in the vehicle; empty: /tf_static tells."
+        (), "Of the LiDAR in the vehicle: x, y, z (m), roll, pitch, yaw (deg); empty: as /tf_static gives it."
     )
     silent_s: float = setting(0.0, "The drive ends once nothing has come for so long; 0: never.", unit="s", least=0)
 

@@ -171,11 +171,19 @@ def import_opened(
     bad = BadScans()
     if not choices.strict:
         recording = passing_over(recording, bad)
-    recording = replace(recording, notes=(*recording.notes, *suspicious_scans(recording)))
+    recording = replace(recording, notes=(*recording.notes, *_made_up_times(recording), *suspicious_scans(recording)))
     recording, track = prepared(recording, progress)
     recording = replace(recording, notes=(*recording.notes, *check_track(recording, track)))
     imported = write_drive(recording, track, out, scans, vehicle, progress, stand_ins=choices.stand_ins)
     return replace(imported, bad=bad.reasons, quality=quality_of(recording, track))
+
+
+def _made_up_times(recording: Recording) -> tuple[str, ...]:
+    """What a drive's times are where the recording has none."""
+    if recording.timed:
+        return ()
+    rate_hz = (len(recording) - 1) / float((recording.t_ns[-1] - recording.t_ns[0]) * 1e-9)
+    return (f"no times of scans: taken as {rate_hz:.2f} Hz from a made-up day (--poses with times gives them)",)
 
 
 def open_recording(

@@ -15,6 +15,7 @@ from gnd.vehicle_agent.importers.choices import METRES_OF, Choices, anchor_of_te
 from gnd.vehicle_agent.importers.fields import ANY_FIELD
 from gnd.vehicle_agent.importers.listing import listed, listing, result_of
 from gnd.vehicle_agent.importers.output import check_output
+from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.importers.splits import CHOICES
 from gnd.vehicle_agent.importers.trajectories.frames import FRAMES
 
@@ -63,6 +64,18 @@ def import_drives(
     click.echo(f"{out}: {imported.scans} scans")
     for sentence in (*(imported.quality.lines if imported.quality else ()), *imported.skipped):
         click.echo(f"{out}: {sentence}")
+    click.echo(f"next: {next_command(recording, out, choices)}")
+
+
+def next_command(recording: Recording, out: Path, choices: Choices) -> str:
+    """What most people do with such a drive."""
+    if not recording.placed:
+        return (
+            f"gnd import ... --anchor LAT,LON,HEIGHT, for a drive that maps are built from ({out} is marked: no place)"
+        )
+    if not (choices.stand_ins or (recording.gnss and recording.motion)):
+        return f"gnd map build {out} -o map.sqlite (to drive on that map: import with --stand-ins)"
+    return f"gnd map build {out} -o map.sqlite, then with another drive: gnd fleet --drives DRIVE --map map.sqlite"
 
 
 def _choices(anchor: str | None, mount: str | None, time_field: str | None, units: str, **plain: Any) -> Choices:

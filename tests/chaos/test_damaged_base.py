@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gnd.cloud_merger import expander as module
-from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.config import MAX_ATTEMPTS, ShardConfig
 from gnd.cloud_merger.expander import Expander
 from gnd.cloud_merger.ingest import Ingest
 from gnd.deploy.chaos.page import PAGE_BYTES
@@ -49,10 +49,10 @@ def test_an_upload_waits_for_a_page_to_be_mended_and_others_are_looked_at(
     with SqliteStore(path) as store:
         with pytest.raises(StoreDamaged):
             store.get("ndt", near.bases[0].tile_id)
-        config = ShardConfig(max_attempts=3)
+        config = ShardConfig()
         ingest, expander = Ingest(store, config.shard_id), Expander(store, config, lambda *_: None)
         assert [ingest.answer(one.key, one.packed.encode()).status for one in (near, far)] == ["stored"] * 2
-        for _ in range(3 * config.max_attempts):
+        for _ in range(3 * MAX_ATTEMPTS):
             expander.work()
         status = {
             one.report_id: one.state

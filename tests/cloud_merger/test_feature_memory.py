@@ -197,13 +197,14 @@ def test_two_signs_that_a_report_has_told_apart_stay_two_in_later_windows(cloud)
     assert sorted(map(len, apart)) == [0, 1]
 
 
-def test_a_place_becomes_as_sure_over_windows_as_in_one(tmp_path):
+def test_a_place_becomes_as_sure_over_windows_as_in_one(tmp_path, monkeypatch):
     """The same measurements: in one window, and in as many as there are; of 40 vehicles, each twice."""
+    monkeypatch.setattr("gnd.tile_store.sqlite_journal.WINDOW_VEHICLES", 999)
     rng = np.random.default_rng(7)
     at = rng.normal([1.0, 1.0], 0.3, (80, 2))
     got = []
     for name, later_s in (("one", 1.0), ("many", HOUR_S)):
-        cloud = Cloud(tmp_path / f"{name}.sqlite", FeatureMergeParameters(renewal_gain=1.0), window_vehicles=999)
+        cloud = Cloud(tmp_path / f"{name}.sqlite", FeatureMergeParameters(renewal_gain=1.0))
         for k, spot in enumerate(at):
             cloud.sees([f"car-{k % 40}"], found(*spot), base=MAP, later_s=later_s)
         (new,) = set(cloud.head()) - set(MAP)

@@ -25,7 +25,7 @@ def store(tmp_path):
 
 @pytest.fixture
 def worker(store, tmp_path):
-    return Worker(store, ShardConfig(store_path=tmp_path / "map.sqlite", max_attempts=2, retry_s=0.0))
+    return Worker(store, ShardConfig(store_path=tmp_path / "map.sqlite"))
 
 
 @pytest.fixture

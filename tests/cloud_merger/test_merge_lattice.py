@@ -39,7 +39,7 @@ def put(store, base, number, changed, tile=TILE):
 
 
 def merge_once(store, **config):
-    worker = Worker(store, ShardConfig(store_path=store.path, retry_s=0.0, confirmation=VOXEL_BY_VOXEL, **config))
+    worker = Worker(store, ShardConfig(store_path=store.path, confirmation=VOXEL_BY_VOXEL, **config))
     return store.publish(worker.merge(store.claim("one", 16, 30.0)))
 
 

@@ -37,7 +37,7 @@ def test_defaults_run_and_survive_being_written_down():
         ("[merge]\nepsilon = 0.5", "there is no setting merge.epsilon"),
         ("[merge]\nmode = 'best'", "'paper'"),
         ("[merge]\nxi = 1.5", r"xi = 1\.5 lies outside ≥ 0 and < 1"),
-        ("expanders = 0", "expanders"),
+        ("poll_s = 0", "poll_s"),
         ("lease_s = 0", "lease_s"),
         ("shard_id = 'a/b'", "shard id 'a/b'"),
         ("lease_s = ", "no valid TOML"),

@@ -39,9 +39,9 @@ def open_store(path):
 class SlowWorker(Worker):
     """Each merge takes a third of a lease."""
 
-    def _publication(self, work):
+    def _publication(self, *merged):
         time.sleep(LEASE_S / 3)
-        return super()._publication(work)
+        return super()._publication(*merged)
 
 
 @pytest.mark.parametrize("renewed", [True, False])

@@ -20,6 +20,7 @@ from merger_world import (
 )
 from upload_desk import Desk
 
+from gnd.cloud_merger import work
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.work import SETTLED_TOGETHER, Worker, in_turn
 from gnd.gnd_map.gaussian import Gaussians
@@ -42,10 +43,11 @@ def store(tmp_path):
 
 
 @pytest.fixture
-def worker(store, tmp_path):
-    return Worker(
-        store, ShardConfig(store_path=tmp_path / "map.sqlite", retry_s=0.0, max_attempts=3, confirmation=VOXEL_BY_VOXEL)
-    )
+def worker(store, tmp_path, monkeypatch):
+    """Three attempts without a pause."""
+    monkeypatch.setattr(work, "MAX_ATTEMPTS", 3)
+    monkeypatch.setattr(work, "RETRY_S", 0.0)
+    return Worker(store, ShardConfig(store_path=tmp_path / "map.sqlite", confirmation=VOXEL_BY_VOXEL))
 
 
 def put(store, number, tile=TILE, changed=None, base=BASE, version=1):
@@ -135,9 +137,11 @@ def test_a_tile_whose_merge_fails_is_set_aside_after_some_attempts_and_the_other
     assert (store.tiles_set_aside(), store.counts().waiting) == ([], 0)
 
 
-def test_a_damaged_page_stops_its_own_tile_only(tmp_path, caplog):
+def test_a_damaged_page_stops_its_own_tile_only(tmp_path, caplog, monkeypatch):
     path = tmp_path / "damaged.sqlite"
-    config = ShardConfig(store_path=path, retry_s=0.0, max_attempts=2, confirmation=VOXEL_BY_VOXEL)
+    monkeypatch.setattr(work, "MAX_ATTEMPTS", 2)
+    monkeypatch.setattr(work, "RETRY_S", 0.0)
+    config = ShardConfig(store_path=path, confirmation=VOXEL_BY_VOXEL)
     with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([large_tile(NEIGHBOUR), tile_of_states(STATES, TILE)])
         body = store.get("ndt", NEIGHBOUR).body

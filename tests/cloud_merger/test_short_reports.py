@@ -352,6 +352,7 @@ def test_a_fault_of_the_shard_itself_leads_to_the_whole_report(store, desk, monk
         raise ZeroDivisionError("somewhere inside")
 
     monkeypatch.setattr(short_reports, "expand", fails)
+    monkeypatch.setattr("gnd.cloud_merger.expander.RETRY_S", 0.0)
     told = desk.send(KEY, PACKED)
     assert told.status == "quarantined"
     assert "ZeroDivisionError: somewhere inside" in told.reason

@@ -58,13 +58,13 @@ def test_flags_of_others_are_votes_even_when_their_gaussians_were_withheld():
     assert mask(NEW, known(SAME, SAME, SAME, SAME, SAME, withheld(NEW))) == [False]
 
 
-def test_a_modified_voxel_needs_fewer_votes():
+def test_a_modified_voxel_needs_fewer_votes(monkeypatch):
     """2 of 5 exceeds 0.7 x 0.5, and not 0.7 x 0.6."""
-    want = WantParameters(share=0.7)
-    assert mask(MODIFIED, known(SAME, SAME, SAME, MODIFIED), want) == [True]
-    assert mask(NEW, known(SAME, SAME, SAME, NEW), want) == [False]
+    monkeypatch.setattr("gnd.cloud_merger.wants.WANT_SHARE", 0.7)
+    assert mask(MODIFIED, known(SAME, SAME, SAME, MODIFIED)) == [True]
+    assert mask(NEW, known(SAME, SAME, SAME, NEW)) == [False]
     paper = MergeParameters(mode="paper", xi=0.6)
-    assert mask(NEW, known(), want, paper) == [True]
+    assert mask(NEW, known(), merge=paper) == [True]
 
 
 @pytest.mark.parametrize(("in_hand", "expected"), [(0, True), (3, True), (4, False), (9, False)])
@@ -139,8 +139,6 @@ def test_of_many_outvoted_flags_some_are_asked_for_to_test_the_poses():
 def test_absurd_parameters_are_refused():
     with pytest.raises(MergerError, match="sample = -1 lies outside ≥ 0"):
         WantParameters(sample=-1)
-    with pytest.raises(MergerError, match=r"share = 1\.5 lies outside 0 … 1"):
-        WantParameters(share=1.5)
     with pytest.raises(MergerError, match="enough = -1 lies outside ≥ 0"):
         WantParameters(enough=-1)
 

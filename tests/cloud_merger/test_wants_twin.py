@@ -12,7 +12,7 @@ from gnd.cloud_merger.memory import VOXEL, TileMemory
 from gnd.cloud_merger.parameters import MERGE_XI_RESHAPED, MergeParameters
 from gnd.cloud_merger.statements import Kind, Report, statements_of
 from gnd.cloud_merger.votes import TileVotes
-from gnd.cloud_merger.wants import Known, WantParameters, _promised, _sample, _wanted_of_tile
+from gnd.cloud_merger.wants import WANT_SHARE, Known, WantParameters, _promised, _sample, _wanted_of_tile
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.day import day_of
 from gnd.gnd_map.gaussian import Gaussians
@@ -40,7 +40,7 @@ def by_statements(own, reports, known, merge, want):
     measured = may_agree & (rows["kind"] == Kind.MEASURED) & (rows["was"] == was[seat])
     in_hand = np.bincount(seat, measured, len(ids)) + _promised(known.promised, ids)
     xi = np.where(modified & (merge.mode == "default"), MERGE_XI_RESHAPED, merge.xi)
-    may_win = votes > want.share * xi * cast
+    may_win = votes > WANT_SHARE * xi * cast
     anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
     return (may_win & (in_hand < want.enough)) | anyway
 

@@ -124,8 +124,9 @@ def test_a_settled_voxel_does_not_change_on_one_vehicles_word_nor_on_its_repetit
     assert cloud.ids() == [0, 1, 2]
 
 
-def test_a_vehicle_that_talks_closes_no_window(tmp_path):
-    cloud = Cloud(tmp_path / "map.sqlite", window_vehicles=3)
+def test_a_vehicle_that_talks_closes_no_window(tmp_path, monkeypatch):
+    monkeypatch.setattr("gnd.tile_store.sqlite_journal.WINDOW_VEHICLES", 3)
+    cloud = Cloud(tmp_path / "map.sqlite")
     cloud.sees(["a", "b", "c"], later_s=1)
     cloud.sees(["a"] * 20, later_s=1)
     assert cloud.store.windows()[0].window == 1

@@ -15,7 +15,7 @@ class Desk:
     """One shard without its bus; `told` is what it has said, with the vehicle that it was said to."""
 
     def __init__(self, store, name="desk", on_journaled=lambda: None, on_stored=lambda: None, now_ns=NOW, **settings):
-        config = ShardConfig(name, retry_s=0.0, **settings)
+        config = ShardConfig(name, **settings)
         self.store, self.told = store, []
         self.ingest = Ingest(store, name, on_stored, now_ns=lambda: now_ns)
         self.expander = Expander(store, config, self._tell, on_journaled)

@@ -31,6 +31,9 @@ WORDS = {
     "shard_id": "merger-7", "codec": "float", "link": "3g", "layer": "ndt2", "vehicle": "w", "localise_by": "lidar",
     "wrong_mounts": ("3:0.5",), "connect": ("tcp/10.0.0.1:7448",),
     "layers": ("ndt", "signs"), "passing_rule": "ahead", "protocol": "full", "mode": "paper",
+    "source": "",  # another needs that there is no recording
+    "points": "/a/points", "gnss": "/a/fix", "speed": "/a/odometry", "imu": "/a/imu", "vehicle_frame": "base",
+    "mount": (0.5, 0.0, 1.5, 0.0, 0.0, 90.0),
 }  # fmt: skip
 
 
@@ -92,7 +95,8 @@ def test_every_value_changed_means_every_value(program: str) -> None:
 
     old, new = (flat(tomllib.loads(settings_text(c))) for c in (BARE[program], other(BARE[program])))
     same = {path for path in old if old[path] == new.get(path)}
-    assert same <= {".localise_by"}, same  # "graph" asks for feature layers and no LiDAR
+    # "graph" asks for feature layers and no LiDAR; another source than a recording for no recording.
+    assert same <= {".localise_by", ".live.source"}, same
 
 
 @pytest.mark.parametrize("program", list(BARE))
@@ -195,8 +199,8 @@ def test_a_bad_file_is_one_clear_error(said: str, message: str, tmp_path: Path) 
 def test_the_fleet_hands_settings_to_agents_and_shards(tmp_path: Path) -> None:
     file = tmp_path / "fleet.toml"
     file.write_text("agents = 2\n[agent.report]\nlongest_s = 30.0\n[merger]\npoll_s = 0.5\n")
-    config = load_fleet_config(file, {"shards": 1}, ["agent.report.apart_s=4", "merger.store.window_s=60"], {})
-    assert config.agent == {"report": {"longest_s": 30.0, "apart_s": 4}}
+    config = load_fleet_config(file, {"shards": 1}, ["agent.report.longest_m=300", "merger.store.window_s=60"], {})
+    assert config.agent == {"report": {"longest_s": 30.0, "longest_m": 300}}
     assert config.merger == {"poll_s": 0.5, "store": {"window_s": 60}}
     assert (config.agents, config.shards) == (2, 1)
     for change, message in (

@@ -94,7 +94,7 @@ def test_profiles_of_one_name_are_refused(run, tmp_path):
 
 
 def test_a_page_that_cannot_be_written_is_an_error(run, tmp_path):
-    with pytest.raises(PageError, match=r"cannot write the page .*absent/t\.html: No such file or directory"):
+    with pytest.raises(PageError, match=r"cannot write the page .*absent/t\.html: the folder .*absent does not exist"):
         invoke(run, "--page", tmp_path / "absent" / "t.html")
 
 

@@ -12,9 +12,10 @@ from gnd.fleet_bus.errors import BusClosed, NoRouter
 from gnd.fleet_bus.ledger import Ledger
 
 
-def test_a_burst_arrives_whole_and_in_order(router, client, key):
+def test_a_burst_arrives_whole_and_in_order(router, client, key, monkeypatch):
     """zenoh's default drops half of it: publishers block, and the router's queue is long."""
-    sender, receiver = client(router), client(router, queue_limit=10_000)
+    monkeypatch.setattr("gnd.fleet_bus.subscribing.QUEUE_LIMIT", 10_000)
+    sender, receiver = client(router), client(router)
     inbox = Inbox()
     receiver.subscribe(key, inbox)
     inbox.wait_connected(sender, key)
@@ -52,8 +53,9 @@ def test_a_subscriber_hears_its_region_and_nothing_else(router, client, key):
     assert inbox.payloads == [b"13033/03021/23031/22102", b"13033/03021/33333/00000"]
 
 
-def test_a_stuck_callback_blocks_neither_the_session_nor_the_sender(router, client, key):
-    sender, receiver = client(router), client(router, queue_limit=10)
+def test_a_stuck_callback_blocks_neither_the_session_nor_the_sender(router, client, key, monkeypatch):
+    monkeypatch.setattr("gnd.fleet_bus.subscribing.QUEUE_LIMIT", 10)
+    sender, receiver = client(router), client(router)
     release = threading.Event()
     inbox = Inbox(lambda _key, _payload: release.wait(10))
     subscription = receiver.subscribe(key, inbox)

@@ -240,8 +240,9 @@ def test_handlers_run_side_by_side(router, client, key):
     assert answers == [b"met", b"met"]
 
 
-def test_a_full_mailbox_says_busy_and_is_asked_again(router, client, key):
-    server, bus = client(router, queue_limit=1), client(router)
+def test_a_full_mailbox_says_busy_and_is_asked_again(router, client, key, monkeypatch):
+    monkeypatch.setattr("gnd.fleet_bus.serving.QUEUE_LIMIT", 1)
+    server, bus = client(router), client(router)
     release = threading.Event()
 
     def slow(request):

@@ -12,7 +12,7 @@ import zenoh
 from bus_testing import Inbox, RouterProcess, sockets_to, wait_for
 
 from gnd.fleet_bus.bus import open_bus
-from gnd.fleet_bus.config import ROUTER_LEASE_MS, BusConfig, assert_rules, zenoh_config
+from gnd.fleet_bus.config import MAX_MESSAGE_BYTES, ROUTER_LEASE_MS, BusConfig, assert_rules, zenoh_config
 from gnd.fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter
 from gnd.fleet_bus.router import open_router
 
@@ -143,24 +143,27 @@ def test_a_router_takes_more_sessions_than_zenoh_by_default():
     assert setting(BusConfig(mode="router"), "transport/unicast/max_sessions") == 10_000
 
 
-def test_max_sessions_is_the_limit_of_a_router(endpoint, client):
+def test_max_sessions_is_the_limit_of_a_router(endpoint, client, monkeypatch):
     """The setting that we raise is the one that refuses vehicles."""
-    with open_bus(BusConfig(mode="router", connect=(), listen=(endpoint,), max_sessions=2)):
+    monkeypatch.setattr("gnd.fleet_bus.config.MAX_SESSIONS", 2)
+    with open_bus(BusConfig(mode="router", connect=(), listen=(endpoint,))):
         client(endpoint), client(endpoint)
         with pytest.raises(NoRouter):
             open_bus(BusConfig(connect=(endpoint,), open_timeout_s=0.2))
 
 
 def test_too_large_a_message_is_refused_before_it_is_sent(router, client, key):
-    bus = client(router, max_message_bytes=1000)
-    with pytest.raises(MessageTooLarge, match="a change message has 1001 bytes, more than max_message_bytes 1000"):
-        bus.request(key, bytes(1001), kind="change")
+    bus, too_large = client(router), bytes(MAX_MESSAGE_BYTES + 1)
+    with pytest.raises(MessageTooLarge, match="a change message has 16777217 bytes, the limit is 16777216"):
+        bus.request(key, too_large, kind="change")
     with pytest.raises(MessageTooLarge):
-        bus.publish(key, bytes(1001), kind="update")
+        bus.publish(key, too_large, kind="update")
 
 
-def test_a_receiver_drops_what_exceeds_its_limit_and_lives_on(router, client, key):
-    sender, receiver = client(router), client(router, max_message_bytes=100_000)
+def test_a_receiver_drops_what_exceeds_its_limit_and_lives_on(router, client, key, monkeypatch):
+    sender = client(router)
+    monkeypatch.setattr("gnd.fleet_bus.config.MAX_MESSAGE_BYTES", 100_000)
+    receiver = client(router)
     inbox = Inbox()
     receiver.subscribe(key, inbox)
     inbox.wait_connected(sender, key)
@@ -192,7 +195,6 @@ def test_a_bus_of_the_parent_is_refused_after_a_fork(router, client, key):
         ({"listen": ("tcp/127.0.0.1:7447",)}, "a client does not listen"),
         ({"mode": "peer"}, "mode must be client or router"),
         ({"lease_ms": 50}, "lease_ms must be 100 or more"),
-        ({"queue_limit": 0}, "must be positive"),
     ],
 )
 def test_unusable_settings_are_refused(settings, words):

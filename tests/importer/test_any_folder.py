@@ -189,7 +189,7 @@ def test_points_that_are_none_and_empty_scans_are_counted(kitti_folder, tmp_path
     imported = import_recording("auto", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR)
     assert (imported.scans, imported.empty_scans) == (6, 2)
     assert (imported.points_not_finite, imported.points_too_far) == (12, 2)
-    assert "no times of points, not deskewed" in imported.skipped[0]
+    assert any("no times of points, not deskewed" in note for note in imported.skipped)
     assert imported.skipped[-3:] == (
         "2 scans without a usable point: left out",
         "12 points that are no numbers: left out",

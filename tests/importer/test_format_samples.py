@@ -256,8 +256,11 @@ def test_las_of_a_map_and_a_damaged_one(tmp_path):
         open_recording("auto", las_folder(tmp_path / "a", shift=450_000.0)).read(0)
     damaged = las_folder(tmp_path / "b") / "1.las"
     damaged.write_bytes(damaged.read_bytes()[:200])
+    recording = open_recording("auto", tmp_path / "b")
+    assert len(recording) == 2
+    assert "1.las: no readable LAS" in recording.notes[0]
     with pytest.raises(ImportDriveError, match=r"1\.las: no readable LAS"):
-        open_recording("auto", tmp_path / "b")
+        open_recording("auto", tmp_path / "b", choices=Choices(strict=True))
     (tmp_path / "b" / "0.las").write_bytes(b"no LAS at all")
     with pytest.raises(ImportDriveError, match="which is no LAS"):
         open_recording("auto", tmp_path / "b")
@@ -283,6 +286,30 @@ def test_pcd_with_times_and_stamps_as_names(tmp_path):
     assert "t, against the stamp, in us" in recording.entries[0].detail
     plain = open_recording("auto", tmp_path, choices=Choices(fields=FieldChoice("none")))
     assert not plain.read(0).t_offset_ns.any()
+
+
+def test_a_file_of_another_sensor_among_pcds_is_named(tmp_path):
+    for k in range(4):
+        names = ("x", "y", "z", "ring") if k == 2 else ("x", "y", "z", "t")
+        rows = np.zeros(500, [(name, "<f4") for name in names])
+        for axis, name in enumerate("xyz"):
+            rows[name] = scan_of(k)[:500, axis]
+        pcd(tmp_path / f"{k}.pcd", " ".join(names), "4 4 4 4", "F F F F", rows)
+    recording = open_recording("auto", tmp_path)
+    with pytest.raises(
+        ImportDriveError, match=r"2\.pcd: fields x, y, z, ring; the others have x, y, z, t: another sensor"
+    ):
+        recording.read(2)
+    assert len(recording.read(3)) == 500
+
+
+def test_a_damaged_first_bin_does_not_decide(tmp_path):
+    folder = bins(tmp_path / "a", 5)
+    (folder / "000000.bin").write_bytes(b"\0\1\2")
+    recording = open_recording("auto", folder)
+    assert recording.read(1).ring is not None
+    with pytest.raises(ImportDriveError, match="3 bytes, which is no multiple of 20"):
+        recording.read(0)
 
 
 def test_velodyne_captures(shared_data):

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,15 @@ from recording_testing import scan_of, write_bin
 from gnd.deploy.prepare import Source
 from gnd.schemas.drive_mcap import drive_counts, read_header
 from gnd.schemas.errors import NoPlace
-from gnd.tile_store.build import BuildParameters, drive_sources
+from gnd.tile_store.build import drive_sources
+from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import import_recording
 from gnd.vehicle_agent.importer_cli import import_drives
 from gnd.vehicle_agent.importers.choices import Choices, mount_of_text
 from gnd.vehicle_agent.importers.output import check_output
 from gnd.vehicle_agent.importers.recording import RecordingAnchor
+from gnd.vehicle_agent.vehicle import open_vehicle
 
 ANCHOR = RecordingAnchor(35.6586, 139.7454, 40.0)
 NOWHERE = Choices(nowhere=True)
@@ -39,7 +42,7 @@ def test_a_drive_from_nowhere_is_marked_and_no_shared_map_takes_it(kitti_folder,
     import_recording("auto", kitti_folder, tmp_path / "a.mcap", choices=NOWHERE)
     assert read_header(tmp_path / "a.mcap").nowhere
     with pytest.raises(NoPlace, match="imported with --nowhere"):
-        drive_sources([tmp_path / "a.mcap"], BuildParameters())
+        drive_sources([tmp_path / "a.mcap"])
     again = import_recording("auto", tmp_path / "a.mcap", tmp_path / "b.mcap", choices=NOWHERE)
     assert again.scans == 8
     assert read_header(tmp_path / "b.mcap").nowhere  # importing it again gives it no place
@@ -47,7 +50,7 @@ def test_a_drive_from_nowhere_is_marked_and_no_shared_map_takes_it(kitti_folder,
     assert not read_header(tmp_path / "c.mcap").nowhere
 
 
-def test_a_fleet_and_a_vehicle_refuse_a_drive_from_nowhere(kitti_folder, tmp_path):
+def test_a_fleet_refuses_a_drive_from_nowhere(kitti_folder, tmp_path):
     from gnd.deploy.fleet_config import FleetConfig
     from gnd.deploy.prepare import prepare_recorded
     from gnd.deploy.run_folder import RunFolder
@@ -55,6 +58,14 @@ def test_a_fleet_and_a_vehicle_refuse_a_drive_from_nowhere(kitti_folder, tmp_pat
     import_recording("auto", kitti_folder, tmp_path / "a.mcap", choices=NOWHERE)
     with pytest.raises(NoPlace, match="no shared map may take it"):
         prepare_recorded(FleetConfig(), RunFolder(tmp_path / "run"), Source(drives=(tmp_path / "a.mcap",)))
+
+
+def test_a_vehicle_refuses_a_drive_from_nowhere(kitti_folder, tmp_path):
+    choices = Choices(nowhere=True, stand_ins=True)
+    import_recording("auto", kitti_folder, tmp_path / "a.mcap", choices=choices)
+    config = AgentConfig("probe", tmp_path / "a.mcap", tmp_path / "work")
+    with pytest.raises(NoPlace, match="no shared map may take it"), open_vehicle(config, threading.Event()):
+        pass
 
 
 def same(path: Path) -> Path:
@@ -141,6 +152,7 @@ def test_sensor_mount_and_heading_are_what_was_given(kitti_folder, tmp_path):
     assert result.exit_code == 0, result.output
     header = read_header(out)
     assert (header.sensor_model, header.mount) == ("OS1-64", "given")
+    assert f"next: gnd map build {out} -o map.sqlite" in result.output
     np.testing.assert_allclose(header.T_vehicle_lidar[:3, 3], [1.5, 0.1, 1.73])
 
 
@@ -185,8 +197,13 @@ def test_feet_are_found_against_the_fixes_and_taken_when_told(kitti_folder, tmp_
 
 def test_z_downwards_is_found_against_the_ground(kitti_folder, tmp_path):
     flipped = with_points(kitti_folder, lambda points: points * [1.0, 1.0, -1.0])
+    import_recording("auto", kitti_folder, tmp_path / "right.mcap", anchor=ANCHOR)
+    notes = import_recording("auto", flipped, tmp_path / "a.mcap", anchor=ANCHOR).notes  # KITTI's mount is given
+    assert any(note.startswith("warning: the ground lies 1.7") for note in notes)
+    for path in (flipped / "calib.txt", flipped / "poses.txt"):
+        path.unlink()
     with pytest.raises(ImportDriveError, match=r"ground lies 1\.7\d m \*above\* the LiDAR"):
-        import_recording("auto", flipped, tmp_path / "a.mcap", anchor=ANCHOR)
+        import_recording("auto", flipped / "velodyne", tmp_path / "b.mcap", anchor=ANCHOR)
 
 
 def test_millimetres_are_found_by_their_size(kitti_folder, tmp_path):

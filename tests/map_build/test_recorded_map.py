@@ -20,7 +20,7 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import DriveHeader, ReferencePose, Scan
 from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
-from gnd.tile_store.build import BuildError, BuildParameters, drive_sources
+from gnd.tile_store.build import BuildError, drive_sources
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.map_build.build import BuiltMap, build_recorded_map, no_progress
 from gnd.vehicle_agent.map_build.quality import Quality, measure
@@ -118,8 +118,8 @@ def colonnade(path: Path, shift_m: float, seed: int, mount_m: float = 1.9) -> Pa
 def test_a_street_that_repeats_itself_closes_no_wrong_loop(tmp_path: Path) -> None:
     """Two passes, the second 1.2 m off along; every 6 m looks the same, and drives may be off by more than that."""
     paths = [colonnade(tmp_path / "a.mcap", 0.0, 1), colonnade(tmp_path / "b.mcap", 1.2, 2)]
-    sources = drive_sources(paths, BuildParameters())
-    surveys = [look_over(source, BuildParameters(), no_progress) for source in sources]
+    sources = drive_sources(paths)
+    surveys = [look_over(source, no_progress) for source in sources]
     found, report = refine_poses(sources, surveys, "auto", no_progress)
     assert report.candidates is not None
     assert report.candidates.ambiguous > 0.5 * report.candidates.tried

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from store_helpers import EAGER, EAST, TILE, only_claim, report, report_id, tile_of_voxels
 
 from gnd.cloud_merger.announce import encoded, update_of
+from gnd.deploy.map_cli import map_group
 from gnd.fleet_bus.errors import Refused
 from gnd.gnd_map.codec import PREFERRED
 from gnd.gnd_map.content import codecs_of_layer, encode_content_delta
@@ -27,7 +28,6 @@ from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRe
 from gnd.schemas.updates import TileUpdate, updated
 from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.build import build_map
-from gnd.tile_store.cli import map_group
 from gnd.tile_store.compare import layer_info, map_diff, version_diff
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.export import ExportError, export_map

@@ -135,7 +135,6 @@ def test_quarantine_keeps_bytes_reason_and_count(store: Store, clock: Clock) -> 
     [
         {"merge_delay_s": -1.0},
         {"window_s": 0.0},
-        {"window_vehicles": 0},
         {"window_reports": 0},
     ],
 )

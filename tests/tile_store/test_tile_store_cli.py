@@ -196,7 +196,7 @@ def test_what_cannot_be_is_said_in_one_line_and_nothing_is_made(path: Path, tmp_
     assert "not like 2026" in refused("diff", path, "--since", "yesterday")
     assert "no tiles in layer" in refused("info", path, "--layer", "signs")
     assert "no tiles in layer" in refused("export", path, tmp_path / "x.pcd", "--region", "13000")
-    assert "unknown export format 'las'" in refused("export", path, tmp_path / "x.las")
+    assert "unknown export format 'shp'" in refused("export", path, tmp_path / "x.shp")
     assert "base-4 digits" in refused("info", path, "--region", "9")
     assert sorted(tmp_path.iterdir()) == before
 

@@ -24,7 +24,7 @@ from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.link.download import TileFetcher
 
-QUICK = DownloadParameters(request_s=0.6, retry_s=0.1, in_flight=3)
+QUICK = DownloadParameters(request_s=0.6, in_flight=3)
 NEVER = threading.Event()
 
 

@@ -38,7 +38,7 @@ from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.surroundings import Surroundings
 
 NEVER = threading.Event()
-PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=60.0, retry_s=0.1)
+PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=60.0)
 THIN = LinkProfile("thin", down_bit_s=2.2e5, up_bit_s=2.2e5, delay_ms=5.0, burst_bytes=0)
 
 

@@ -202,12 +202,13 @@ def test_an_answer_to_another_question_is_refused(
 
 
 def test_a_server_that_always_says_later_is_not_asked_without_a_pause(
-    bus: Bus, cache: TileCache, cloud: Bus, tiles: dict[TileId, Tile]
+    bus: Bus, cache: TileCache, cloud: Bus, tiles: dict[TileId, Tile], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("gnd.vehicle_agent.link.download.RETRY_S", 60.0)
     tile = one(tiles)
     cache.put(tile)
     asked = serve(cloud, tile, TileAnswer("later"))
-    fetcher = TileFetcher(bus, cache, DownloadParameters(in_flight=2, retry_s=60.0))
+    fetcher = TileFetcher(bus, cache, DownloadParameters(in_flight=2))
     fetcher.want([tile.tile_id])
     wait_until(lambda: fetcher.counts["cached"] == 1)
     fetcher.want([tile.tile_id])

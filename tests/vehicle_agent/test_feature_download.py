@@ -28,7 +28,7 @@ from gnd.vehicle_agent.link.feature_download import FeatureDownloader
 TILE, EAST = TileId(497353963154), TileId(497353963155)
 COV_M2 = np.array([0.04, 0.0, 0.0, 0.04, 0.0, 1e4])
 NEVER = threading.Event()
-QUICK = DownloadParameters(request_s=5.0, retry_s=0.1)
+QUICK = DownloadParameters(request_s=5.0)
 
 
 def sign(number: int, x_m: float = 1.0) -> Feature:
@@ -182,7 +182,7 @@ def test_without_a_router_the_cache_has_to_do_until_it_is_back(free_port: int, t
                 downloader.close()
             world.server.close()
         with open_bus(BusConfig(connect=(endpoint,)), name="second") as bus:  # nobody answers
-            short = DownloadParameters(request_s=0.5, retry_s=0.1)
+            short = DownloadParameters(request_s=0.5)
             downloader = FeatureDownloader(bus, tmp_path / "c.sqlite", ("signs",), short)
             download(downloader, TILE)
             assert downloader.counts["cached"] == 1

@@ -242,5 +242,5 @@ def test_parameters_out_of_range_are_refused() -> None:
         SlamcuParameters(particles=0)
     with pytest.raises(SlamcuParameterError, match="detection_confidence = 1"):
         SlamcuParameters(detection_confidence=1.0)
-    with pytest.raises(SlamcuParameterError, match="map_sigma_m = nan"):
-        SlamcuParameters(map_sigma_m=float("nan"))
+    with pytest.raises(SlamcuParameterError, match="detection_confidence = nan"):
+        SlamcuParameters(detection_confidence=float("nan"))

@@ -17,6 +17,7 @@ from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.report import reporter as reporting
 from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment import SegmentedScan
 
@@ -103,8 +104,6 @@ def moment(x_m: float, t_s: float) -> PoseEstimate:
 
 
 PATIENT = {
-    "soon_voxels": 10**9,
-    "apart_s": 1000.0,
     "longest_s": 1000.0,
     "unchanged_s": 1000.0,
     "longest_m": 1e6,
@@ -112,7 +111,10 @@ PATIENT = {
 }
 
 
-def test_only_tiles_left_behind_are_decided(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
+def test_only_tiles_left_behind_are_decided(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "SOON_VOXELS", 10**9)
     drive = reporter(tiles, outbox, **PATIENT)
     drive.add_scan(scan(hits))
     drive.leave_behind(estimate(x_m=0.0), 0.0)
@@ -131,9 +133,10 @@ def changed_in(found: list[ChangeReport]) -> int:
 
 
 def test_changes_are_reported_in_mid_district_a_moment_after_their_tiles_were_left(
-    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = reporter(tiles, outbox, soon_voxels=8)
+    monkeypatch.setattr(reporting, "SOON_VOXELS", 8)
+    drive = reporter(tiles, outbox)
     drive.add_scan(scan(hits))
     drive.leave_behind(moment(74.0, 9.0), 74.0)  # the wall's tiles are left, others of their districts are not
     assert drive.classes["deleted"] >= 8
@@ -152,10 +155,16 @@ def test_changes_are_reported_in_mid_district_a_moment_after_their_tiles_were_le
     ("soon_voxels", "wall_x_m", "waits_s"), [(8, 14.3, 0.3), (10_000, 14.3, 40.0), (8, 9.3, 120.0)], ids=str
 )
 def test_few_changes_wait_for_more_and_ground_that_is_as_it_was_waits_longest(
-    tiles: dict[TileId, Tile], outbox: Outbox, soon_voxels: int, wall_x_m: float, waits_s: float
+    tiles: dict[TileId, Tile],
+    outbox: Outbox,
+    soon_voxels: int,
+    wall_x_m: float,
+    waits_s: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A wall that was moved; the same where that counts as little; and a wall that stands where it stood."""
-    drive = reporter(tiles, outbox, soon_voxels=soon_voxels)
+    monkeypatch.setattr(reporting, "SOON_VOXELS", soon_voxels)
+    drive = reporter(tiles, outbox)
     drive.add_scan(scan(look([(wall_x_m, -8.0, 8.0, 4.0)], np.random.default_rng(3))))
     drive.leave_behind(moment(74.0, 0.0), 74.0)
     pending = drive.classes["deleted"] + drive.classes["new"] + drive.classes["modified"]
@@ -166,8 +175,12 @@ def test_few_changes_wait_for_more_and_ground_that_is_as_it_was_waits_longest(
     assert reports(outbox)
 
 
-def test_where_much_has_changed_reports_keep_apart(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
-    drive = reporter(tiles, outbox, soon_voxels=8, apart_s=5.0)
+def test_where_much_has_changed_reports_keep_apart(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "SOON_VOXELS", 8)
+    monkeypatch.setattr(reporting, "APART_S", 5.0)
+    drive = reporter(tiles, outbox)
     drive.add_scan(scan(hits))
     for t_s in (9.0, 9.4):
         drive.leave_behind(moment(74.0, t_s), 74.0)
@@ -184,9 +197,10 @@ def test_where_much_has_changed_reports_keep_apart(tiles: dict[TileId, Tile], ou
 
 @pytest.mark.parametrize(("wall_x_m", "way_m"), [(14.3, 400.0), (9.3, 1000.0)])
 def test_a_long_way_in_a_district_is_reported_before_its_end(
-    tiles: dict[TileId, Tile], outbox: Outbox, wall_x_m: float, way_m: float
+    tiles: dict[TileId, Tile], outbox: Outbox, wall_x_m: float, way_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = reporter(tiles, outbox, soon_voxels=10_000)
+    monkeypatch.setattr(reporting, "SOON_VOXELS", 10_000)
+    drive = reporter(tiles, outbox)
     drive.add_scan(scan(look([(wall_x_m, -8.0, 8.0, 4.0)], np.random.default_rng(3))))
     for further_m, reported in ((0.0, False), (way_m - 1.0, False), (way_m + 1.0, True)):
         drive.leave_behind(estimate(x_m=74.0), 74.0 + further_m)  # up and down the same street
@@ -228,10 +242,13 @@ def test_a_restarted_agent_that_puts_other_tiles_together_states_each_tile_once_
     hits: np.ndarray,
     first_stops: tuple[float, ...],
     again_stops: tuple[float, ...],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It was killed on the way; its map is another by now, so it decides and reports at other moments."""
+    monkeypatch.setattr(reporting, "SOON_VOXELS", 8)
+    monkeypatch.setattr(reporting, "APART_S", 0.0)
     for stops, ends in ((first_stops, not first_stops), (again_stops, True)):
-        drive = reporter(tiles, outbox, soon_voxels=8, apart_s=0.0)
+        drive = reporter(tiles, outbox)
         drive.add_scan(scan(hits))
         for x_m in stops:
             drive.leave_behind(moment(x_m, x_m), x_m)
@@ -244,7 +261,7 @@ def test_a_restarted_agent_that_puts_other_tiles_together_states_each_tile_once_
     assert stated == sorted(tiles)
 
 
-@pytest.mark.parametrize("bad", [{"longest_s": 150.0}, {"apart_s": -1.0}, {"soon_voxels": 0}, {"longest_m": 2000.0}])
+@pytest.mark.parametrize("bad", [{"longest_s": 150.0}, {"longest_s": -1.0}, {"longest_m": 2000.0}])
 def test_waiting_times_that_contradict_each_other_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(AgentConfigError):
         ReportParameters(**bad)  # type: ignore[arg-type]

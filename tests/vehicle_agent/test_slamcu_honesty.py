@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from sign_road import FEW, Road, driven
+from sign_road import Road, driven
 
 RUNS = 100
 ROAD = Road(
@@ -28,16 +28,16 @@ def nees(error: np.ndarray, cov: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_covariances_of_new_features_measured_ones_and_the_vehicle_are_honest() -> None:
+def test_covariances_of_new_features_measured_ones_and_the_vehicle_are_honest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Signs of the map before and after the new one; the map's own error is drawn anew in each drive."""
     feature, pose, seen = [], [], []
-    parameters = replace(FEW, map_sigma_m=0.0)
+    monkeypatch.setattr("gnd.vehicle_agent.features.slamcu.track_list.MAP_SIGMA_M", 0.0)
     for seed in range(RUNS):
         survey = 0.1 * np.random.default_rng([seed, 5]).standard_normal((2, 2))
         road = replace(
             ROAD, mapped=[tuple(np.array(place) + off) for place, off in zip(ROAD.mapped, survey, strict=True)]
         )
-        slamcu = driven(road, seed, parameters, sigma_m=0.7, sigma_deg=0.3)
+        slamcu = driven(road, seed, sigma_m=0.7, sigma_deg=0.3)
         (new,) = slamcu.new_features()
         feature.append(nees(new.position_m - NEW, new.cov_m2))
         at, cov = slamcu.pose()

@@ -24,6 +24,7 @@ F32 = NDArray[np.float32]
 WIDTHS: Final = (4, 5)
 MOST_RINGS: Final = 128
 GOOD: Final = 0.99
+LOOKED_AT: Final = 5
 PERIOD_NS: Final = 100_000_000
 START_NS: Final = 1_000_000_000_000_000_000
 """Where neither names nor a file tell times."""
@@ -115,11 +116,16 @@ def open_bins(folder: Path, anchor: RecordingAnchor | None) -> Recording:
 
 
 def _width_of_files(files: list[Path]) -> int:
-    """Of the first files that hold any points."""
-    for path in files[:5]:
-        data = read_file(path)
-        if data:
-            return width_of(path, data)
+    """Of the first file that holds points and is not damaged; the damaged ones are named when they are read."""
+    first: ImportDriveError | None = None
+    for path in files[:LOOKED_AT]:
+        try:
+            if data := read_file(path):
+                return width_of(path, data)
+        except ImportDriveError as error:
+            first = first or error
+    if first is not None:
+        raise first
     return WIDTHS[0]
 
 

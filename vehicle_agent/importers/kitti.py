@@ -62,6 +62,7 @@ def open_kitti(folder: Path, anchor: RecordingAnchor | None) -> Recording:
         stamp="middle",
         placed=anchor is not None,
         timed=bool(files_of(folder, *TIME_FILES)),
+        notes=("times count from the first scan: the day is made up",) if files_of(folder, *TIME_FILES) else (),
     )
 
 

@@ -38,13 +38,22 @@ def open_las(folder: Path, anchor: RecordingAnchor | None, choices: Choices | No
         ImportDriveError: no files, damaged files, points in the coordinates of a map.
         MissingExtra: laspy (or lazrs, for LAZ) is not installed.
     """
-    del choices
     check_folder(folder)
     files = sorted(files_below(folder, *ENDINGS), key=scan_number)
     if not files:
         raise ImportDriveError(f"{folder}: no .las or .laz files there or in the folders below it")
-    begins = [_begin_ns(_read(path)) for path in files]
-    t_ns, how = _times(files, begins)
+    begins, bad = dict[Path, int | None](), list[str]()
+    for path in files:
+        try:
+            begins[path] = _begin_ns(_read(path))
+        except ImportDriveError as error:
+            if choices is not None and choices.strict:
+                raise
+            bad.append(f"passed over: {error}")
+    if len(begins) < 2:
+        raise ImportDriveError(f"{folder}: {len(begins)} of {len(files)} files can be read: {'; '.join(bad[:3])}")
+    files = list(begins)
+    t_ns, how = _times(files, list(begins.values()))
     return Recording(
         name=folder.name,
         sensor_model="unknown",
@@ -56,6 +65,7 @@ def open_las(folder: Path, anchor: RecordingAnchor | None, choices: Choices | No
         mount="assumed",
         placed=anchor is not None,
         timed=how != "none",
+        notes=tuple(bad),
         entries=(Entry(files[0].parent.name, "LAS sweeps", len(files), f"times: {how}", "scans"),),
     )
 

@@ -50,7 +50,7 @@ def open_pcd(folder: Path, anchor: RecordingAnchor | None, choices: Choices | No
         source=f"PCD files of {folder.name}; motion from the track",
         T_vehicle_lidar=np.eye(4),
         t_ns=t_ns,
-        read=lambda i: scan_of_fields(_points(files[i]), int(t_ns[i]), rule),
+        read=lambda i: scan_of_fields(_points(files[i], fields), int(t_ns[i]), rule),
         anchor=anchor or NOMINAL,
         track=track,
         mount="assumed",
@@ -82,11 +82,15 @@ def read_scan(path: Path, t_ns: int) -> RawScan:
     return RawScan(t_ns, xyz, np.zeros(len(xyz), np.uint32))
 
 
-def _points(path: Path) -> NDArray[np.void]:
+def _points(path: Path, fields: tuple[str, ...] = ()) -> NDArray[np.void]:
+    """The points of a file, whose fields must be those of the others where these are given."""
     points = read_pcd(path)
     missing = {"x", "y", "z"} - set(points.dtype.names or ())
     if missing:
         raise ImportDriveError(f"{path}: no field {', '.join(sorted(missing))}")
+    if fields and points.dtype.names != fields:
+        held = ", ".join(points.dtype.names or ())
+        raise ImportDriveError(f"{path}: fields {held}; the others have {', '.join(fields)}: another sensor?")
     return points
 
 

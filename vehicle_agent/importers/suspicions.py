@@ -64,25 +64,28 @@ def suspicious_scans(recording: Recording) -> tuple[str, ...]:
                 f"{recording.name}: {far:.0%} of the points of scan {i} lie beyond {MAX_RANGE_M:.0f} m: other units"
                 " (--units mm, cm, ft), or points of a map frame instead of the sensor's?"
             )
-    _check_upright(recording, [points for _, s in scans if (points := cleaned(s).scan) is not None])
+    notes += _upside_down(recording, [points for _, s in scans if (points := cleaned(s).scan) is not None])
     return tuple(notes)
 
 
-def _check_upright(recording: Recording, scans: list[Scan]) -> None:
-    """Refuse clouds whose ground is seen only when z is turned round."""
+def _upside_down(recording: Recording, scans: list[Scan]) -> list[str]:
+    """A warning where the ground is seen only when z is turned round; refused unless somebody gave the mount (in a
+    tunnel a LiDAR may see the ceiling and not the road).
+    """
     R = recording.T_vehicle_lidar[:3, :3]
     clouds = [np.asarray(scan.points_m, np.float64) @ R.T for scan in scans]
     if len(clouds) < 3:
-        return
+        return []
     plain = ground_of_scans([ground_of(cloud, None) for cloud in clouds])
     if isinstance(plain, GroundSeen):
-        return
+        return []
     turned = ground_of_scans([ground_of(cloud * [1.0, 1.0, -1.0], None) for cloud in clouds])
-    if isinstance(turned, GroundSeen):
-        raise ImportDriveError(
-            f"{recording.name}: the ground lies {turned.height_m:.2f} m *above* the LiDAR: its z points downwards or is"
-            " mirrored; a LiDAR that hangs upside down: --mount X,Y,Z,180,0,0"
-        )
+    if not isinstance(turned, GroundSeen):
+        return []
+    said = f"the ground lies {turned.height_m:.2f} m *above* the LiDAR: its z points downwards or is mirrored"
+    if recording.mount == "given":
+        return [f"warning: {said}, or this is a ceiling"]
+    raise ImportDriveError(f"{recording.name}: {said}; one that hangs upside down: --mount X,Y,Z,180,0,0")
 
 
 def check_track(recording: Recording, track: Trajectory) -> tuple[str, ...]:

@@ -24,6 +24,8 @@ DOWNLOAD_BATCH_S: Final = 0.25
 
 POLL_S = 0.25
 OFFLINE_WAIT_S = 0.5
+RETRY_S = 1.0
+"""Pause before a tile that got no answer is asked for again."""
 WRONG_TRIES = 3
 MOST_TILES = 1024  # of one district
 FIRST_GUESS_BYTES = 4_096
@@ -251,7 +253,7 @@ class TileFetcher(Generic[TileT]):
 
     def _do_without(self, tile_id: TileId, cached: TileT | None) -> None:
         """No answer: the cached tile has to do, once, and the tile is asked for again after a pause."""
-        self._not_before[tile_id] = time.monotonic() + self._parameters.retry_s
+        self._not_before[tile_id] = time.monotonic() + RETRY_S
         if cached is not None:
             self._stale.add(tile_id)
             self._answered.add(tile_id)

@@ -18,8 +18,8 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.gnd_map.tile import Tile
 from gnd.tile_store.build import (
+    POINT_RANGE_M,
     BuildError,
-    BuildParameters,
     MapPoints,
     MapSource,
     drive_sources,
@@ -87,7 +87,6 @@ def build_recorded_map(
     n_min_cells: int = N_MIN_CELLS,
     keep_movers: bool = False,
     refine: RefineMode = "auto",
-    parameters: BuildParameters | None = None,
     progress: Progress = no_progress,
 ) -> BuiltMap:
     """Build the tiles that the drives measured and put them into the store as a new base, all or none.
@@ -100,7 +99,6 @@ def build_recorded_map(
         n_min_cells: a voxel holds a Gaussian from so many occupied sub-cells on.
         keep_movers: what moves, and the vehicle itself, stay in the map.
         refine: whether poses are closed in loops and tied to GNSS; see `refine_poses`.
-        parameters: which points and poses are used.
         progress: called after each scan of each step.
 
     Raises:
@@ -108,15 +106,14 @@ def build_recorded_map(
         DriveError: a drive cannot be read.
         StoreError: an unknown codec, or the store cannot take the tiles.
     """
-    parameters = parameters or BuildParameters()
     lattice = map_lattice(layer, codec)
-    sources = drive_sources(drives, parameters)
-    surveys = [look_over(source, parameters, progress) for source in sources]
+    sources = drive_sources(drives)
+    surveys = [look_over(source, progress) for source in sources]
     sources, poses = refine_poses(sources, surveys, refine, progress)
-    measured, counts = MapPoints(sources, parameters), list[BuiltDrive]()
+    measured, counts = MapPoints(sources), list[BuiltDrive]()
     for source, survey in zip(sources, surveys, strict=True):
         counts.append(BuiltDrive())
-        for points_map_m in _standing(source, survey, parameters, keep_movers, counts[-1], progress):
+        for points_map_m in _standing(source, survey, keep_movers, counts[-1], progress):
             measured.add(points_map_m)
     if not sum(one.scans for one in counts):
         missing = sum((one.without_pose for one in counts), Counter[NoPose]())
@@ -134,14 +131,13 @@ def reasons(missing: Counter[NoPose]) -> str:
 def _standing(
     source: MapSource,
     survey: DriveSurvey,
-    parameters: BuildParameters,
     keep_movers: bool,
     counts: BuiltDrive,
     progress: Progress,
 ) -> Iterator[F64]:
     """Points (N, 3) in the map frame of what stands still, scan after scan; `counts` is filled."""
     segmenter = MotionSegmenter(replace(MOVERS, enabled=not keep_movers))
-    for scan in _scans(source, survey.bodywork, parameters, keep_movers, counts, progress):
+    for scan in _scans(source, survey.bodywork, keep_movers, counts, progress):
         for done in segmenter.push(scan):
             yield _still(done, counts)
     for done in segmenter.flush():
@@ -156,7 +152,6 @@ def _still(one: SegmentedScan, counts: BuiltDrive) -> F64:
 def _scans(
     source: MapSource,
     bodywork: Bodywork,
-    parameters: BuildParameters,
     keep_bodywork: bool,
     counts: BuiltDrive,
     progress: Progress,
@@ -169,7 +164,7 @@ def _scans(
             counts.without_pose[reason] += 1
             continue
         mount = source.header.T_vehicle_lidar
-        one = placed(scan, source.poses, mount, (parameters.min_range_m, parameters.max_range_m))
+        one = placed(scan, source.poses, mount, POINT_RANGE_M)
         counts.scans, counts.points = counts.scans + 1, counts.points + len(one.points_map_m)
         yield one if keep_bodywork else _without(one, bodywork, counts)
 

@@ -10,7 +10,7 @@ from gnd.gnd_map.arrays import F32, F64, I64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.schemas.drive import Scan
-from gnd.tile_store.build import BuildParameters, MapSource
+from gnd.tile_store.build import POINT_RANGE_M, MapSource
 from gnd.vehicle_agent.localise.parameters import SamplingParameters
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from gnd.vehicle_agent.map_build.bodywork import EVERY_M, Bodywork, BodyworkSurvey
@@ -50,7 +50,7 @@ def way_of(poses: Trajectory) -> F64:
     return np.concatenate([[0.0], np.cumsum(step_m)])
 
 
-def look_over(source: MapSource, parameters: BuildParameters, progress: Progress) -> DriveSurvey:
+def look_over(source: MapSource, progress: Progress) -> DriveSurvey:
     """Look over a drive with the poses that it has.
 
     Raises:
@@ -64,7 +64,7 @@ def look_over(source: MapSource, parameters: BuildParameters, progress: Progress
         at_m = float(np.interp(t_ns, source.poses.t_ns, way_m))
         if (found and at_m - found[-1][1] < EVERY_M) or why_no_pose(scan, source.poses):
             continue
-        points = _vehicle_points(source, scan, parameters)
+        points = _vehicle_points(source, scan)
         seen.add(points)
         road_z = road_below(points, source.header.T_vehicle_lidar[:3, 3])
         chosen = points[sample_scan(points - source.header.T_vehicle_lidar[:3, 3], SAMPLED)]
@@ -80,8 +80,8 @@ def look_over(source: MapSource, parameters: BuildParameters, progress: Progress
     )
 
 
-def _vehicle_points(source: MapSource, scan: Scan, parameters: BuildParameters) -> F64:
-    one = placed(scan, source.poses, source.header.T_vehicle_lidar, (parameters.min_range_m, parameters.max_range_m))
+def _vehicle_points(source: MapSource, scan: Scan) -> F64:
+    one = placed(scan, source.poses, source.header.T_vehicle_lidar, POINT_RANGE_M)
     return transform(T_inverse(one.estimate.T_map_vehicle), one.points_map_m)
 
 

@@ -53,8 +53,13 @@ STEP_M = 2.0  # tiles left behind are looked for after this much way
 _LEAVE_M: Final = 4.0
 """A tile this much farther away than detection reaches gets no more evidence: its classes are decided. It holds how far
 the LiDAR stands from the vehicle's origin, and what the vehicle drives during a scan."""
+SOON_VOXELS: Final = 48
+"""Where so many voxels of one tile have changed, a report is due at once. On ground that has not changed, detection
+errs in up to some 30."""
 _SOON_S: Final = 0.3
-"""Where much has changed, a report waits this long for tiles that are left together with the first."""
+"""Such a report waits this long for tiles that are left together with the first ..."""
+APART_S: Final = 3.0
+"""... and follows the one before no faster than this."""
 
 _log = logging.getLogger(__name__)
 
@@ -116,8 +121,8 @@ class _PendingTiles:
             return False
         if odometer_m - self.changed_m > most.longest_m or t_ns - self.changed_ns > most.longest_s * 1e9:
             return True
-        apart = reported_ns is None or t_ns - reported_ns > most.apart_s * 1e9
-        many = max(len(change.changed) for change in self.changes.values()) >= most.soon_voxels
+        apart = reported_ns is None or t_ns - reported_ns > APART_S * 1e9
+        many = max(len(change.changed) for change in self.changes.values()) >= SOON_VOXELS
         return many and apart and t_ns - self.changed_ns > _SOON_S * 1e9
 
 

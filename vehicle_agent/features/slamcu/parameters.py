@@ -16,13 +16,6 @@ class SlamcuParameters:
     detection_confidence: float = setting(
         0.9, "Confidence in a detection: λ of Eq. (1) and (2).", least=1e-3, most=0.999
     )
-    map_sigma_m: float = setting(
-        0.05,
-        "Error of each axis of a map feature's position beside the covariance that the map gives it.",
-        unit="m",
-        least=0,
-        most=1e3,
-    )
 
     def __post_init__(self) -> None:
         check_settings(self, SlamcuParameterError)

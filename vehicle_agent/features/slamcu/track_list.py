@@ -6,6 +6,7 @@ begun, ended, merged or taken for another; nothing is decided here.
 
 from collections.abc import Collection
 from math import nan
+from typing import Final
 
 import numpy as np
 
@@ -16,12 +17,15 @@ from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
 from gnd.vehicle_agent.features.slamcu.tracked_feature import KNOWN_MASSES, NEW_MASSES, TrackedFeature, recount
 
+MAP_SIGMA_M: Final = 0.05
+"""Error of each axis of a map feature's position beside the covariance that the map gives it."""
+
 
 class TrackList:
     """Features, and their slots in the particles.
 
     Args:
-        parameters: of existence and map.
+        parameters: of existence.
         known: the map's features.
         particles: where features are estimated.
 
@@ -52,7 +56,7 @@ class TrackList:
         held = {feature.number for feature in self.known} & set(known.feature_id.tolist())
         if held:
             raise BadMapFeatures(f"{len(held)} features are held already, the first {min(held)}; forget them first")
-        extra = np.eye(2) * self._parameters.map_sigma_m**2
+        extra = np.eye(2) * MAP_SIGMA_M**2
         for i, number in enumerate(known.feature_id.tolist()):
             cov = known.cov[i] + extra
             packed = np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
