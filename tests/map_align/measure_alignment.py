@@ -18,7 +18,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.se3 import T_inverse, exp_so3
 from gnd.gnd_map.tile import Tile
-from gnd.tile_store.build import BuildParameters, build_map
+from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.map_align.align import Alignment, align_clouds, difference
 from gnd.vehicle_agent.map_align.candidates import Reach, about
@@ -35,7 +35,7 @@ def tiles_of(drive: Path) -> tuple[Tile, ...]:
     store_path = drive.with_suffix(".sqlite")
     store_path.unlink(missing_ok=True)
     with SqliteStore(store_path) as store:
-        build_map([drive], store, parameters=BuildParameters(max_gnss_offset_m=100.0))
+        build_map([drive], store)
         stored = [store.get("ndt", entry.tile) for entry in store.heads("ndt")]
         return tuple(tile for one in stored if one is not None and isinstance(tile := one.decode(), Tile))
 

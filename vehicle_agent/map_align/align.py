@@ -47,7 +47,7 @@ _MOST: Final = 0.6
 MIN_AREA_M2: Final = 600.0
 MIN_UPRIGHT: Final = 150
 """Upright surfaces of B where A knows anything."""
-MIN_SHARE: Final = 0.6
+MIN_SHARE: Final = 0.4
 """Of them have their surface in A."""
 MIN_LEVEL_SHARE: Final = 0.5
 MAX_SECOND: Final = 0.85
