@@ -21,7 +21,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
 from gnd.tile_client.fetching import TileServerClient
 from gnd.tile_client.following import NewVersion, RegionFollower
-from gnd.tile_client.notices import Notice
+from gnd.tile_client.notices import QueuedNotice
 
 LAYER: Final = "ndt"
 CATALOG_PERIOD_S: Final = 3.0
@@ -118,7 +118,7 @@ class TileWatch:
         self._emit(_missed(found, before) if found.notice is None else _event_of(found.notice))
 
 
-def _event_of(notice: Notice) -> WatchEvent:
+def _event_of(notice: QueuedNotice) -> WatchEvent:
     update = notice.update
     put, removed = update.voxels or (None, None)
     return WatchEvent(

@@ -9,7 +9,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import update_keys
 from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_client.fetching import TileServerClient
-from gnd.tile_client.notices import Notice, Notices
+from gnd.tile_client.notices import Notices, QueuedNotice
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class NewVersion:
     layer: str
     tile: TileId
     version: int
-    notice: Notice | None
+    notice: QueuedNotice | None
 
 
 class RegionFollower:

@@ -16,7 +16,7 @@ MOST_KEYS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Notice:
+class QueuedNotice:
     """An update notice, the size of its message in bytes, and when it arrived, ns UTC."""
 
     update: TileUpdate
@@ -49,7 +49,7 @@ class Notices:
         for key in list(self._followed)[: -max(MOST_KEYS, len(keys))]:
             self._followed.pop(key).close()
 
-    def take(self, wait_s: float = 0.0) -> Notice | None:
+    def take(self, wait_s: float = 0.0) -> QueuedNotice | None:
         """The next notice; None where none came within `wait_s`.
 
         Raises:
@@ -59,7 +59,7 @@ class Notices:
             payload, received_ns = self._waiting.get(timeout=wait_s) if wait_s else self._waiting.get_nowait()
         except queue.Empty:
             return None
-        return Notice(TileUpdate.decode(payload), len(payload), received_ns)
+        return QueuedNotice(TileUpdate.decode(payload), len(payload), received_ns)
 
     def may_have_been_lost(self) -> bool:
         """Whether, since the last call, the connection was lost and made anew, or notices were dropped here."""

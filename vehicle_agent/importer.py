@@ -42,7 +42,7 @@ from gnd.vehicle_agent.importers.overrides import BadScans, as_chosen, passing_o
 from gnd.vehicle_agent.importers.pcap import open_pcap
 from gnd.vehicle_agent.importers.pcd import open_pcd
 from gnd.vehicle_agent.importers.planes import open_planes
-from gnd.vehicle_agent.importers.quality import Quality, fixes_within, quality_of
+from gnd.vehicle_agent.importers.quality import ImportQuality, fixes_within, quality_of
 from gnd.vehicle_agent.importers.radiate import open_radiate
 from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Entry, Recording, RecordingAnchor
 from gnd.vehicle_agent.importers.ros.reader import open_ros
@@ -97,7 +97,7 @@ class Imported:
     points_too_far: int
     notes: tuple[str, ...] = ()
     bad: tuple[str, ...] = ()
-    quality: Quality | None = None
+    quality: ImportQuality | None = None
 
     @property
     def skipped(self) -> tuple[str, ...]:

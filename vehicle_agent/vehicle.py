@@ -25,7 +25,7 @@ from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.result import PoseEvaluation
 from gnd.vehicle_agent.sources.live import LiveError
-from gnd.vehicle_agent.sources.opening import Source, open_source
+from gnd.vehicle_agent.sources.opening import DriveSource, open_source
 from gnd.vehicle_agent.way import WAY_FILE, Way
 
 _log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class AgentVehicle:
     """Everything that one drive needs; made by `open_vehicle`, owned by the agent's main thread."""
 
     config: AgentConfig
-    source: Source
+    source: DriveSource
     stop: threading.Event
     link: Link
     pipeline: VehiclePipeline

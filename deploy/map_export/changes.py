@@ -97,7 +97,7 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
-class Changes:
+class ChangedVoxels:
     """The clusters, largest first, and how many voxels lie alone and were left out."""
 
     changes: tuple[Change, ...]
@@ -114,7 +114,7 @@ class _Source:
 
 
 @dataclass(frozen=True, slots=True)
-class _Voxels:
+class _VoxelTable:
     """Changed voxels of one tile and kind in a common frame."""
 
     tile: TileId
@@ -128,7 +128,7 @@ class _Voxels:
 def map_changes(
     old: Store, new: Store, *, layer: str, prefix: str = "", old_at_ns: int | None = None, tile: TileId | None = None,
     versions: tuple[int, int] | None = None,
-) -> Changes:  # fmt: skip
+) -> ChangedVoxels:  # fmt: skip
     """Object-like changes of a region between two stores, two times of one store, or two versions of a tile.
 
     Args:
@@ -151,7 +151,7 @@ def map_changes(
         raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
     numbers = versions or (None, None)
     frame = LocalFrame.of_tile(tiles[len(tiles) // 2])
-    voxels: dict[What, list[_Voxels]] = {"new": [], "gone": [], "changed": []}
+    voxels: dict[What, list[_VoxelTable]] = {"new": [], "gone": [], "changed": []}
     reporters = _Reporters(new, layer)
     for one in tiles:
         before = old.get(layer, one, numbers[0], old_at_ns)
@@ -162,7 +162,7 @@ def map_changes(
     clusters = [cluster for what, found in voxels.items() for cluster in _clusters(what, found, frame)]
     changes = [one for one in clusters if isinstance(one, Change)]
     changes.sort(key=lambda one: (-one.voxels, one.lat_deg, one.lon_deg))
-    return Changes(tuple(changes), sum(one for one in clusters if isinstance(one, int)))
+    return ChangedVoxels(tuple(changes), sum(one for one in clusters if isinstance(one, int)))
 
 
 class _Reporters:
@@ -190,7 +190,7 @@ class _Reporters:
 
 def _changed(
     tile: TileId, before: StoredTile | None, after: StoredTile | None, frame: LocalFrame, source: Any
-) -> Iterator[tuple[What, _Voxels]]:
+) -> Iterator[tuple[What, _VoxelTable]]:
     """The voxels of a tile that are new, gone, or of another shape."""
     a = before.decode_gaussians().gaussians if before else Gaussians.empty()
     b = after.decode_gaussians().gaussians if after else Gaussians.empty()
@@ -214,10 +214,10 @@ def _changed(
             mean_tile_m = VoxelGrid.of(tile).centre_m(g.voxel_id) + g.mean_m
             cov = T[:3, :3] @ g.full_cov() @ T[:3, :3].T
             mean_m = mean_tile_m @ T[:3, :3].T + T[:3, 3]
-            yield what, _Voxels(tile, g.voxel_id, mean_m, cov, g.count.astype(np.int64), where)
+            yield what, _VoxelTable(tile, g.voxel_id, mean_m, cov, g.count.astype(np.int64), where)
 
 
-def _clusters(what: What, found: Sequence[_Voxels], frame: LocalFrame) -> Iterator[Change | int]:
+def _clusters(what: What, found: Sequence[_VoxelTable], frame: LocalFrame) -> Iterator[Change | int]:
     """The clusters of one kind; then how many voxels lie alone."""
     if not found:
         return
@@ -233,7 +233,7 @@ def _clusters(what: What, found: Sequence[_Voxels], frame: LocalFrame) -> Iterat
     yield int((cluster < 0).sum())
 
 
-def _change(what: What, voxels: list[tuple[_Voxels, int]], frame: LocalFrame) -> Change:
+def _change(what: What, voxels: list[tuple[_VoxelTable, int]], frame: LocalFrame) -> Change:
     mean_m = np.stack([one.mean_m[i] for one, i in voxels])
     cov_m2 = np.stack([one.cov_m2[i] for one, i in voxels])
     count = np.array([one.count[i] for one, i in voxels])
@@ -293,7 +293,7 @@ def _shape(size_m: F64) -> Shape:
 
 
 def _seen(
-    voxels: list[tuple[_Voxels, int]],
+    voxels: list[tuple[_VoxelTable, int]],
 ) -> tuple[datetime | None, datetime | None, int | None, int, float | None]:
     """First and last seen, vehicles, reports, confidence."""
     ids: set[str] = set()

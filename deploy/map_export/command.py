@@ -11,7 +11,7 @@ from rich.console import Console
 
 from gnd.deploy.map_export.autoware import export_autoware
 from gnd.deploy.map_export.change_files import WRITERS, write_changes
-from gnd.deploy.map_export.changes import Changes, map_changes
+from gnd.deploy.map_export.changes import ChangedVoxels, map_changes
 from gnd.deploy.map_export.foxglove import write_mcap
 from gnd.deploy.map_export.las import export_las
 from gnd.deploy.map_export.projection import PROJECTORS
@@ -150,13 +150,13 @@ def diff(
 
 def _changes(
     old: Store, new: Store, layer: str, region: str, old_at_ns: int | None, pair: tuple[TileId, int, int] | None
-) -> Changes:
+) -> ChangedVoxels:
     if pair is None:
         return map_changes(old, new, layer=layer, prefix=region, old_at_ns=old_at_ns)
     return map_changes(old, new, layer=layer, tile=pair[0], versions=pair[1:])
 
 
-def _print_diff(console: Console, result: MapDiff, found: Changes | None, to: Path | None) -> None:
+def _print_diff(console: Console, result: MapDiff, found: ChangedVoxels | None, to: Path | None) -> None:
     tables.print_diff(console, result)
     if found is not None:
         kinds = Counter(f"{change.change} {change.shape}" for change in found.changes)

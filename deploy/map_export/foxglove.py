@@ -20,7 +20,7 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap_protobuf.writer import Writer
 
-from gnd.deploy.map_export.scene import Scene
+from gnd.deploy.map_export.scene import ExportScene
 from gnd.tile_store.export import write_whole
 
 Message = tuple[int, str, Any]
@@ -29,7 +29,7 @@ _TYPES = {"<f4": PackedElementField.FLOAT32, "<u4": PackedElementField.UINT32, "
 _NS_PER_S = 1_000_000_000
 
 
-def write_mcap(scene: Scene, path: Path) -> None:
+def write_mcap(scene: ExportScene, path: Path) -> None:
     """Write the scene; ExportError when the file cannot be written."""
 
     def write(stream: Any) -> None:
@@ -40,7 +40,7 @@ def write_mcap(scene: Scene, path: Path) -> None:
     write_whole(path, write)
 
 
-def _messages(scene: Scene) -> Iterator[Message]:
+def _messages(scene: ExportScene) -> Iterator[Message]:
     start_ns = scene.start_ns
     origin = math.degrees(scene.frame.lat_rad), math.degrees(scene.frame.lon_rad)
     yield start_ns, "/map/origin", _fix(start_ns, *origin)

@@ -45,7 +45,7 @@ class Update:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class ExportScene:
     """What is shown.
 
     Attributes:
@@ -74,7 +74,7 @@ def store_of(path: Path) -> Path:
     return RunFolder(path).store if path.is_dir() else path
 
 
-def read_scene(store: Store, layer: str, prefix: str, run: Path | None = None) -> Scene:
+def read_scene(store: Store, layer: str, prefix: str, run: Path | None = None) -> ExportScene:
     """The map of a region, its changes, and the ways of the vehicles where `run` is the folder of a run.
 
     Raises:
@@ -84,7 +84,7 @@ def read_scene(store: Store, layer: str, prefix: str, run: Path | None = None) -
     tiles = region_tiles(store, layer, prefix)
     frame = region_frame(tiles)
     updates = [update for tile in tiles for update in _updates(store, layer, tile.tile_id, frame)]
-    return Scene(
+    return ExportScene(
         frame=frame,
         points_m=np.concatenate([_means(tile.tile_id, tile.gaussians, frame) for tile in tiles]),
         count=np.concatenate([tile.gaussians.count for tile in tiles]),

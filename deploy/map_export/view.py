@@ -7,7 +7,7 @@ import click
 import numpy as np
 
 from gnd.deploy.map_export.libraries import library
-from gnd.deploy.map_export.scene import RGB, Scene, read_scene, store_of
+from gnd.deploy.map_export.scene import RGB, ExportScene, read_scene, store_of
 from gnd.gnd_map.classes import ChangeClass
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.options import PATH, layer_option, region_option, to_read
@@ -45,7 +45,7 @@ def view(path: Path, save: Path | None, region: str, layer: str) -> None:
     )
 
 
-def log_scene(rerun: Any, recording: Any, scene: Scene) -> None:
+def log_scene(rerun: Any, recording: Any, scene: ExportScene) -> None:
     """Send the scene to a recording of Rerun: entities map, changes/*, vehicles/*."""
     recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     grey = _shades(scene.points_m)

@@ -12,7 +12,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import TileId
 from studies.codec_scenes import kl_median
 from studies.speed.contest import Absent, Contest, Entrant
-from studies.speed.scene import Scene
+from studies.speed.scene import SpeedScene
 
 CODEC: Final = "standard"
 LAZ_STEP_M: Final = 0.01
@@ -21,7 +21,7 @@ CLOUD_M: Final = 0.2
 NOT_HERE: Final = "not installed (extra `peers`)"
 
 
-class Coder(NamedTuple):
+class MapCoder(NamedTuple):
     """Writes a street and reads it.
 
     Attributes:
@@ -39,7 +39,7 @@ class Coder(NamedTuple):
     judge: Callable[[Any], str]
 
 
-def coding_contests(scene: Scene) -> list[Contest]:
+def coding_contests(scene: SpeedScene) -> list[Contest]:
     """Writing and reading."""
     held = {tile_id: scene.local_map.tile(tile_id) for tile_id in scene.local_map.tiles}
     tiles = {tile_id: tile.gaussians for tile_id, tile in held.items() if tile is not None and len(tile.gaussians)}
@@ -56,15 +56,15 @@ def coding_contests(scene: Scene) -> list[Contest]:
     ]
 
 
-def _unless(one: Coder | Absent, entrant: Callable[[Coder], Entrant]) -> Entrant | Absent:
+def _unless(one: MapCoder | Absent, entrant: Callable[[MapCoder], Entrant]) -> Entrant | Absent:
     return one if isinstance(one, Absent) else entrant(one)
 
 
-def _writing(coder: Coder) -> Entrant:
+def _writing(coder: MapCoder) -> Entrant:
     return Entrant(coder.name, coder.write, lambda written: f"{coder.size(written) / 1e3:,.0f} kB")
 
 
-def _reading(coder: Coder) -> Entrant:
+def _reading(coder: MapCoder) -> Entrant:
     written = coder.write()
     return Entrant(coder.name, lambda: coder.read(written), coder.judge)
 
@@ -75,10 +75,10 @@ def _thinned(points: F64) -> F64:
     return points[first]
 
 
-def _ours(tiles: dict[TileId, Gaussians]) -> Coder:
+def _ours(tiles: dict[TileId, Gaussians]) -> MapCoder:
     lattice = LATTICES[CODEC]
     codec = next(one for one in CODECS.values() if one.lattice == lattice)
-    return Coder(
+    return MapCoder(
         f"ours, {codec.name}",
         lambda: {tile_id: codec.encode(tile_id, snap(one, lattice)) for tile_id, one in tiles.items()},
         lambda bodies: {tile_id: codec.decode(tile_id, body) for tile_id, body in bodies.items()},
@@ -87,7 +87,7 @@ def _ours(tiles: dict[TileId, Gaussians]) -> Coder:
     )
 
 
-def _laz(cloud_m: F64) -> Iterator[Coder | Absent]:
+def _laz(cloud_m: F64) -> Iterator[MapCoder | Absent]:
     try:
         import laspy
         import lazrs  # noqa: F401  (laspy says so only when it writes)
@@ -108,10 +108,10 @@ def _laz(cloud_m: F64) -> Iterator[Coder | Absent]:
     def read(body: bytes) -> F64:
         return np.asarray(laspy.read(io.BytesIO(body), laz_backend=backend).xyz)
 
-    yield Coder("LAZ", write, read, len, lambda points: _off(points, cloud_m))
+    yield MapCoder("LAZ", write, read, len, lambda points: _off(points, cloud_m))
 
 
-def _draco(cloud_m: F64) -> Iterator[Coder | Absent]:
+def _draco(cloud_m: F64) -> Iterator[MapCoder | Absent]:
     name = f"Draco, {DRACO_BITS} bits"
     try:
         import DracoPy
@@ -131,7 +131,7 @@ def _draco(cloud_m: F64) -> Iterator[Coder | Absent]:
     def judge(_: Any) -> str:
         return _off(read(write(preserve_order=True)), cloud_m)  # the order tells which point is which
 
-    yield Coder(name, write, read, len, judge)
+    yield MapCoder(name, write, read, len, judge)
 
 
 def _off(points: Any, original_m: F64) -> str:

@@ -18,7 +18,7 @@ from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from gnd.vehicle_agent.localise.scan_odometry import ScanOdometry, joint_step
 from studies.speed.contest import Absent, Contest, Entrant
-from studies.speed.scene import Scene
+from studies.speed.scene import SpeedScene
 
 OFF_M, OFF_DEG = 0.3, 1.0
 CONVERGED_M, CONVERGED_DEG = 0.1, 0.3
@@ -30,7 +30,7 @@ Align = Callable[[F64, F64], F64]
 """Points (N, 3) in the vehicle frame and a start (4, 4) to T_map_vehicle."""
 
 
-def matching_contest(scene: Scene) -> Contest:
+def matching_contest(scene: SpeedScene) -> Contest:
     """Each scan once, from a start that is a little off."""
     rng = np.random.default_rng(0)
     starts = [T @ _offset(rng) for _, T in scene.unchanged]
@@ -70,7 +70,7 @@ def _found(found: list[F64], truth: list[F64]) -> str:
     )
 
 
-def _ours(scene: Scene) -> Align:
+def _ours(scene: SpeedScene) -> Align:
     parameters = LocaliserParameters()
     cache = MatchMapCache(scene.local_map, parameters.registration.noise_m)
 
@@ -114,7 +114,7 @@ def _small_gicp(cloud: F64) -> list[tuple[str, Align] | Absent]:
 # --- odometry ---------------------------------------------------------------------------------------------------------
 
 
-def odometry_contest(scene: Scene) -> Contest:
+def odometry_contest(scene: SpeedScene) -> Contest:
     """A whole drive, scan by scan, without a map of before."""
     scans = [item for item in scene.drive if isinstance(item, Scan)]
 
@@ -129,7 +129,7 @@ def odometry_contest(scene: Scene) -> Contest:
     return Contest("Odometry", "ms/scan", len(scans), entrant, [_kiss(scene, scans, judge)], notes)
 
 
-def _steps(scene: Scene) -> Trajectory:
+def _steps(scene: SpeedScene) -> Trajectory:
     """T_first_vehicle at the middle of each sweep: the steps of our odometry put one after the other."""
     parameters = LocaliserParameters()
     motion = MotionBuffer()
@@ -155,7 +155,7 @@ def _steps(scene: Scene) -> Trajectory:
     return Trajectory(np.array(times_ns, np.int64), np.stack(poses))
 
 
-def _kiss(scene: Scene, scans: list[Scan], judge: Callable[[Trajectory], str]) -> Entrant | Absent:
+def _kiss(scene: SpeedScene, scans: list[Scan], judge: Callable[[Trajectory], str]) -> Entrant | Absent:
     try:
         from kiss_icp.config import load_config
         from kiss_icp.kiss_icp import KissICP

@@ -15,7 +15,7 @@ from gnd.vehicle_agent.detect.records import make_records
 from gnd.vehicle_agent.local_map import EMPTY
 from studies.speed import yardstick
 from studies.speed.contest import Absent, Contest, Entrant
-from studies.speed.scene import Scene
+from studies.speed.scene import SpeedScene
 
 CLEARLY = 5
 """Rays that must pass an empty voxel before others are asked about it."""
@@ -37,7 +37,7 @@ class PlacedScan(NamedTuple):
     origin: F64
 
 
-def placed(scene: Scene) -> list[PlacedScan]:
+def placed(scene: SpeedScene) -> list[PlacedScan]:
     """The scans of the changed street on their true poses."""
     return [
         PlacedScan(transform(T, points), transform(T, scene.T_vehicle_lidar[None, :3, 3]))
@@ -48,7 +48,7 @@ def placed(scene: Scene) -> list[PlacedScan]:
 class Walk:
     """All scans through one window, by any function that takes what `cast_rays` takes."""
 
-    def __init__(self, scene: Scene, scans: list[PlacedScan]) -> None:
+    def __init__(self, scene: SpeedScene, scans: list[PlacedScan]) -> None:
         local_map, detect = scene.local_map, DetectParameters()
         anchor_m = local_map.mean_map_m.mean(axis=0)
         self._records = make_records(local_map.mean_map_m, local_map.cov_m2, anchor_m, detect)
@@ -83,7 +83,7 @@ class Walk:
         return Counts(self._state.copy(), self._words.copy(), np.concatenate(self._kept))
 
 
-def kernel_contest(scene: Scene, folder: Path) -> Contest:
+def kernel_contest(scene: SpeedScene, folder: Path) -> Contest:
     """The walk alone: numba's and gcc's."""
     scans = placed(scene)
     walk = Walk(scene, scans)
@@ -106,7 +106,7 @@ def kernel_contest(scene: Scene, folder: Path) -> Contest:
     return Contest("The ray kernel", "ms/scan", len(scans), entrant, others, notes)
 
 
-def scan_contest(scene: Scene) -> Contest:
+def scan_contest(scene: SpeedScene) -> Contest:
     """Whole scans into what each holds of a place: evidence about Gaussians, occupancy, voids."""
     scans = placed(scene)
     free_m = _passed_m(scene, scans)
@@ -122,14 +122,14 @@ def scan_contest(scene: Scene) -> Contest:
     return Contest("Whole scans counted", "ms/scan", len(scans), entrant, others, notes)
 
 
-def _detect(scene: Scene, scans: list[PlacedScan]) -> ChangeDetector:
+def _detect(scene: SpeedScene, scans: list[PlacedScan]) -> ChangeDetector:
     detector = ChangeDetector(scene.local_map)
     for points, origin in scans:
         detector.add_scan(points, origin)
     return detector
 
 
-def _passed_m(scene: Scene, scans: list[PlacedScan]) -> F64:
+def _passed_m(scene: SpeedScene, scans: list[PlacedScan]) -> F64:
     """(K, 3) centres of empty voxels that rays have clearly passed, map frame; at most `ASKED`, evenly taken."""
     state = Walk(scene, scans).counts(cast_rays).state
     voxels_g = np.argwhere((state < 0) & (state <= EMPTY - CLEARLY) & (state > EMPTY - 2**24)) + 0.5
@@ -138,7 +138,7 @@ def _passed_m(scene: Scene, scans: list[PlacedScan]) -> F64:
     return np.asarray(np.linalg.solve(A, (voxels_g + scene.local_map.window_origin_g - b).T).T)
 
 
-def _voxel_m(scene: Scene) -> float:
+def _voxel_m(scene: SpeedScene) -> float:
     """The mean edge of a voxel."""
     A, _ = scene.local_map.grid_frame.affine(scene.local_map.mean_map_m.mean(axis=0))
     return float(abs(np.linalg.det(A)) ** (-1 / 3))

@@ -30,7 +30,7 @@ class SpeedOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class SpeedScene:
     """A street and the drives of one sensor.
 
     Attributes:
@@ -54,14 +54,14 @@ class Scene:
     T_vehicle_lidar: F64
 
 
-def scene_of(options: SpeedOptions, sensor: str, folder: Path) -> Scene:
+def scene_of(options: SpeedOptions, sensor: str, folder: Path) -> SpeedScene:
     """Simulate the drives and build the map."""
     world = street(options.seed, StreetOptions(options.length_m))
     cloud, local_map = map_of(simulate_drive(world, MAPPING, folder / "mapping.mcap"))
     before = DriveConfig("car", sensor, "before", seed=1, car_share=0.0, cruise_mps=12.0)
     unchanged = simulate_drive(world, before, folder / "before.mcap")
     changed = simulate_drive(world, replace(before, state="after", seed=2, car_share=0.5), folder / "after.mcap")
-    return Scene(
+    return SpeedScene(
         sensor,
         cloud,
         local_map,

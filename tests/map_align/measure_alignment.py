@@ -20,7 +20,7 @@ from gnd.gnd_map.se3 import T_inverse, exp_so3
 from gnd.gnd_map.tile import Tile
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.map_align.align import Alignment, align_clouds, difference
+from gnd.vehicle_agent.map_align.align import MapAlignment, align_clouds, difference
 from gnd.vehicle_agent.map_align.candidates import Reach, about
 from gnd.vehicle_agent.map_align.cloud import GaussianCloud, cloud_of_tiles
 from gnd.vehicle_agent.map_align.move import moved_drive, moved_tiles
@@ -84,7 +84,7 @@ def spoiled(b: GaussianCloud) -> Iterator[tuple[str, GaussianCloud]]:
     yield "300 m away", b.moved(away)
 
 
-def line(name: str, found: Alignment, T_true: F64 | None = None) -> str:
+def line(name: str, found: MapAlignment, T_true: F64 | None = None) -> str:
     """One row of the account."""
     error = ""
     if T_true is not None:

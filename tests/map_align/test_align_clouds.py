@@ -10,7 +10,7 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.se3 import T_inverse, exp_so3, transform
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_circle
-from gnd.vehicle_agent.map_align.align import Alignment, align_clouds, difference
+from gnd.vehicle_agent.map_align.align import MapAlignment, align_clouds, difference
 from gnd.vehicle_agent.map_align.candidates import Reach, about
 from gnd.vehicle_agent.map_align.cloud import GaussianCloud, cloud_of_tiles
 from gnd.vehicle_agent.map_align.fit import lay_onto, pairs_of
@@ -88,7 +88,7 @@ def motion(seed: int) -> F64:
     return T
 
 
-def why(found: Alignment) -> str:
+def why(found: MapAlignment) -> str:
     return " | ".join(found.reasons)
 
 

@@ -27,9 +27,9 @@ from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
-    Findings,
     ImportOptions,
     MapFeature,
+    MapFindings,
     attributes_of,
 )
 
@@ -117,7 +117,7 @@ def read_argoverse(
     """
     place = city_of(where, city)
     told = read_json(data, where)
-    findings = Findings(options.strict)
+    findings = MapFindings(options.strict)
     borders = _lane_lines(told, where, findings, progress)
     lines = [*borders.lines.values(), *_crosswalks(told, where), *_areas(told, where)]
     left_out: Counter[str] = Counter()
@@ -171,7 +171,7 @@ def _mirrored(mark: str) -> str:
     return next((other + mark.removeprefix(name) for name, other in swapped.items() if mark.startswith(name)), mark)
 
 
-def _lane_lines(told: Any, where: str, findings: Findings, progress: Progress | None) -> _Borders:
+def _lane_lines(told: Any, where: str, findings: MapFindings, progress: Progress | None) -> _Borders:
     segments = member(where, told, "lane_segments", dict)
     borders = _Borders()
     for number, (key, lane) in enumerate(segments.items()):
@@ -214,7 +214,7 @@ def _border(where: str, lane: dict[str, Any], key: str, side: str, points_m: F64
     return _LaneLine("lane_boundary", ("lane", key, side), points_m, attributes)
 
 
-def _check_crossing(where: str, left_m: F64, right_m: F64, findings: Findings) -> None:
+def _check_crossing(where: str, left_m: F64, right_m: F64, findings: MapFindings) -> None:
     met = crossing_of(left_m[:, :2], right_m[:, :2])
     if met is not None:
         x, y = left_m[met[0], :2]

@@ -23,9 +23,9 @@ from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
-    Findings,
     ImportOptions,
     MapFeature,
+    MapFindings,
     attributes_of,
 )
 
@@ -66,7 +66,7 @@ def read_geojson(
     reading = _GeojsonReading(where, source, options, ours)
     left_out: Counter[str] = Counter()
     features: list[MapFeature] = []
-    findings = Findings(options.strict)
+    findings = MapFindings(options.strict)
     for number, item in enumerate(items):
         for feature in _features(reading, item, number):
             if feature.layer == LEFT_OUT:

@@ -13,7 +13,7 @@ from gnd.tile_store.feature_io.lane_crossing import crossing_of
 from gnd.tile_store.feature_io.lane_network import Border, MapLane
 from gnd.tile_store.feature_io.lanelet2_places import NodePlaces
 from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmRelation, OsmWay
-from gnd.tile_store.feature_io.values import Findings, check_vertices
+from gnd.tile_store.feature_io.values import MapFindings, check_vertices
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ def directions(left_m: F64, right_m: F64) -> tuple[bool, bool]:
     return ahead, ahead == same
 
 
-def check_lanelets(document: OsmDocument, borders: Iterable[LaneletBorders], findings: Findings) -> None:
+def check_lanelets(document: OsmDocument, borders: Iterable[LaneletBorders], findings: MapFindings) -> None:
     """A finding for each lanelet whose borders cross each other."""
     for lane in borders:
         met = crossing_of(lane.left_m, lane.right_m)

@@ -22,9 +22,9 @@ from gnd.tile_store.feature_io.osm_kinds import POINT_KINDS, kind_of, told_of
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
-    Findings,
     ImportOptions,
     MapFeature,
+    MapFindings,
     attributes_of,
 )
 
@@ -56,7 +56,7 @@ def read_lanelet2(
         FeatureFileError: one of its family says what is wrong and where.
     """
     document = read_osm(data, where, progress=progress)
-    findings = Findings(options.strict)
+    findings = MapFindings(options.strict)
     drawn, left_out = drawn_features(document, source, options, findings)
     for one in drawn:
         findings.check_simple(one.feature)
@@ -71,7 +71,7 @@ def read_lanelet2(
 
 
 def drawn_features(
-    document: OsmDocument, source: str, options: ImportOptions, findings: Findings | None = None
+    document: OsmDocument, source: str, options: ImportOptions, findings: MapFindings | None = None
 ) -> tuple[list[DrawnLane], dict[str, int]]:
     """The features that elements of a document draw, and how many of which kinds have no layer.
 

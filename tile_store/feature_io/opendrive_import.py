@@ -24,9 +24,9 @@ from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
-    Findings,
     ImportOptions,
     MapFeature,
+    MapFindings,
     attributes_of,
 )
 from gnd.tile_store.feature_io.xml_spans import Element, read_root
@@ -60,7 +60,7 @@ def read_opendrive(
     file = read_xodr(data, where, options)
     left_out: Counter[str] = Counter()
     features: list[MapFeature] = []
-    findings = Findings(options.strict)
+    findings = MapFindings(options.strict)
     for number, road in enumerate(file.roads.values()):
         for thing, feature in drawn_things(file, road, source, options):
             if feature is None:

@@ -159,7 +159,7 @@ def check_positions(name: str, lat_rad: F64, lon_rad: F64, height_m: F64) -> Non
 
 
 @dataclass(slots=True)
-class Findings:
+class MapFindings:
     """What is odd about a file's geometry but loses nothing: it is reported, or with `strict` refused.
 
     Attributes:

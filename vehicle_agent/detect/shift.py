@@ -42,7 +42,7 @@ _REGISTRATION: Final = RegistrationParameters(rules=WITHOUT_WHEELS)
 
 
 @dataclass(frozen=True, slots=True)
-class ShiftTest:
+class ShiftTestRules:
     """When a shift counts as one.
 
     Attributes:
@@ -66,7 +66,7 @@ class ShiftTest:
         return float(np.clip(self.sigmas * sigma_m, self.least_m, self.loosest_m))
 
 
-OF_SCANS: Final = ShiftTest(least_m=0.08, sigmas=3.0, loosest_m=0.15, most_m=5.0, z=3.0)
+OF_SCANS: Final = ShiftTestRules(least_m=0.08, sigmas=3.0, loosest_m=0.15, most_m=5.0, z=3.0)
 """Of a stretch of scans, while driving."""
 
 
@@ -112,11 +112,11 @@ class Shift:
         """Of what does not fit, less what the shift spoils, 0 ... 1."""
         return max(self.explained - self.spoiled, 0) / max(self.misfits, 1)
 
-    def is_far(self, test: ShiftTest, pose: PoseUncertainty) -> bool:
+    def is_far(self, test: ShiftTestRules, pose: PoseUncertainty) -> bool:
         """Whether the best pose nearby is farther off than a pose known so well may be, surely better or not."""
         return test.limit_m(pose) <= self.size_m <= test.most_m
 
-    def is_pose_error(self, test: ShiftTest, pose: PoseUncertainty) -> bool:
+    def is_pose_error(self, test: ShiftTestRules, pose: PoseUncertainty) -> bool:
         """Whether the pose is off by more than a pose known so well may be, and surely so."""
         return self.is_far(test, pose) and self.z >= test.z
 

@@ -23,7 +23,7 @@ FIT_WINDOWS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Quality:
+class ImportQuality:
     """Of a drive.
 
     duration_s, way_m: from first to last scan. gnss_m: median distance of the poses from the fixes, along the ground;
@@ -62,12 +62,12 @@ class Quality:
         return asdict(self)
 
 
-def quality_of(recording: Recording, track: Trajectory) -> Quality:
+def quality_of(recording: Recording, track: Trajectory) -> ImportQuality:
     """Of a recording whose track is known."""
     p = track.T_dst_vehicle[:, :3, 3]
     gnss = residuals_m(recording, track)
     ground = ground_seen(recording)
-    return Quality(
+    return ImportQuality(
         duration_s=float((recording.t_ns[-1] - recording.t_ns[0]) * 1e-9),
         way_m=float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()),
         gnss_m=float(np.median(np.linalg.norm(gnss[:, :2], axis=1))) if len(gnss) else None,

@@ -80,7 +80,7 @@ class DriveState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Step:
+class _MotionStep:
     """The motion since the scan before.
 
     Attributes:
@@ -166,7 +166,7 @@ class TrackedPose:
 
     # --- the motion since the scan before ----------------------------------------------------------------------------
 
-    def _motion_since(self, before: HeldScan, scan: SampledScan) -> _Step:
+    def _motion_since(self, before: HeldScan, scan: SampledScan) -> _MotionStep:
         drive, t_ns = self._drive, scan.t_ns
         T_driven = drive.motion.delta(before.t_ns, t_ns)
         driven = OdometryEdge(T_driven, drive.teacher.sigmas_between(before.t_ns, t_ns, T_driven))
@@ -181,7 +181,7 @@ class TrackedPose:
         drive.co_moving.correct(joint.T_before_now)
         sweep = self._sweep_by_scans(scan) if joint.slipped else None
         share = (end_ns(scan.scan) - scan.scan.t_ns) / (t_ns - before.t_ns)
-        return _Step(T_driven, joint, seen, reach, sweep, sweep_variance(T_driven, seen, share))
+        return _MotionStep(T_driven, joint, seen, reach, sweep, sweep_variance(T_driven, seen, share))
 
     def _scan_step(self, scan: SampledScan, driven: OdometryEdge) -> ScanStep | None:
         """The motion since the scan before by the scans."""
@@ -240,7 +240,7 @@ class TrackedPose:
     # --- what a match and a fix tell ---------------------------------------------------------------------------------
 
     def _learnt_from(
-        self, result: RegistrationResult, predicted: F64, before: HeldScan, step: _Step, t_ns: int
+        self, result: RegistrationResult, predicted: F64, before: HeldScan, step: _MotionStep, t_ns: int
     ) -> MapMatch:
         """A believed match for the graph; its innovation is counted, and the sensors learn from it."""
         drive = self._drive

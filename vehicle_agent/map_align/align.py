@@ -15,7 +15,7 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.se3 import T_inverse, log_so3, transform
 from gnd.vehicle_agent.map_align.candidates import Reach, candidates
 from gnd.vehicle_agent.map_align.cloud import GaussianCloud
-from gnd.vehicle_agent.map_align.fit import NOISE_M, Fit, Score, gains, lay_onto, local_motion, residuals_m, score_of
+from gnd.vehicle_agent.map_align.fit import NOISE_M, Fit, FitScore, gains, lay_onto, local_motion, residuals_m, score_of
 
 Progress = Callable[[str, int, int], None]
 
@@ -59,7 +59,7 @@ MAX_TILT_RAD: Final = float(np.radians(2.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class AlignmentBlock:
     """A part of the overlap and by how much it would lie better elsewhere.
 
     Attributes:
@@ -76,7 +76,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
+class MapAlignment:
     """How B lies on A, and whether to believe it.
 
     Attributes:
@@ -96,12 +96,12 @@ class Alignment:
     T_a_b: F64
     pivot_m: F64
     covariance: F64
-    score: Score
+    score: FitScore
     second: float
     second_m: F64
     median_m: float
     p90_m: float
-    blocks: tuple[Block, ...]
+    blocks: tuple[AlignmentBlock, ...]
     area_m2: float
     bend_m: float
     scale: float
@@ -153,7 +153,7 @@ class Alignment:
         }
 
 
-def align_clouds(a: GaussianCloud, b: GaussianCloud, reach: Reach, progress: Progress | None = None) -> Alignment:
+def align_clouds(a: GaussianCloud, b: GaussianCloud, reach: Reach, progress: Progress | None = None) -> MapAlignment:
     """Lay B onto A.
 
     Args:
@@ -170,7 +170,7 @@ def align_clouds(a: GaussianCloud, b: GaussianCloud, reach: Reach, progress: Pro
     pivot = np.median(shared.mean_m, axis=0)
     core = _sampled(shared.take(np.linalg.norm(shared.mean_m[:, :2] - pivot[:2], axis=1) < _CORE_M))
     near_a = a.take(np.linalg.norm(a.mean_m[:, :2] - pivot[:2], axis=1) < _CORE_M + 2.0 * reach.shift_m)
-    fits = list[tuple[Fit, Score]]()
+    fits = list[tuple[Fit, FitScore]]()
     found = candidates(near_a, core, pivot, reach, _CANDIDATES)
     for done, one in enumerate(found):
         fit = lay_onto(near_a, core, one.T_a_b)
@@ -205,12 +205,15 @@ def _little(area_m2: float, upright: int) -> str:
     )
 
 
-def _nowhere(reason: str, shared: GaussianCloud) -> Alignment:
+def _nowhere(reason: str, shared: GaussianCloud) -> MapAlignment:
     """A refusal before there is any place."""
     pivot = np.median(shared.mean_m, axis=0) if len(shared) else np.zeros(3)
-    nothing, unknown = Score(int(shared.is_upright.sum()), 0, 0.0, int(shared.is_ground.sum()), 0), np.full(3, np.nan)
+    nothing, unknown = (
+        FitScore(int(shared.is_upright.sum()), 0, 0.0, int(shared.is_ground.sum()), 0),
+        np.full(3, np.nan),
+    )
     nan = float("nan")
-    return Alignment(
+    return MapAlignment(
         np.eye(4), pivot, np.diag([1e2] * 6), nothing, nan, unknown, nan, nan, (), _area_m2(shared.mean_m), nan, nan,
         (reason,),
     )  # fmt: skip
@@ -225,7 +228,7 @@ def _sampled(cloud: GaussianCloud) -> GaussianCloud:
 
 
 def _second(
-    a: GaussianCloud, core: GaussianCloud, pivot: F64, fits: list[tuple[Fit, Score]], reach: Reach
+    a: GaussianCloud, core: GaussianCloud, pivot: F64, fits: list[tuple[Fit, FitScore]], reach: Reach
 ) -> tuple[float, F64]:
     """Worth of the best place that is not the best one, as a share of it, and how far it is off (3,).
 
@@ -254,7 +257,9 @@ def _second(
     return max(compared, key=lambda one: one[0], default=(0.0, np.full(3, np.nan)))
 
 
-def _other_places(a: GaussianCloud, core: GaussianCloud, fits: list[tuple[Fit, Score]], reach: Reach) -> Iterator[F64]:
+def _other_places(
+    a: GaussianCloud, core: GaussianCloud, fits: list[tuple[Fit, FitScore]], reach: Reach
+) -> Iterator[F64]:
     """The other fits, and places along the direction that holds least, where everything else may settle."""
     for fit, _ in fits[1:]:
         yield fit.T_a_b
@@ -286,7 +291,7 @@ def _beside(a: GaussianCloud, b: GaussianCloud, T: F64, along: F64) -> F64:
 
 def _judged(
     a: GaussianCloud, b: GaussianCloud, pivot: F64, fit: Fit, second: float, second_m: F64, reach: Reach
-) -> Alignment:
+) -> MapAlignment:
     moved = b.moved(fit.T_a_b)
     row, across_m, matched = residuals_m(a, moved)
     score, shared = score_of(a, moved), moved.take(_within(a, moved, 2.0))
@@ -303,7 +308,7 @@ def _judged(
         *_bend_reasons(bend_m, len(blocks), scale),
     ]
     covariance = _covariance(fit, pivot + where, blocks)
-    return Alignment(
+    return MapAlignment(
         fit.T_a_b, pivot, covariance, score, second, second_m, median_m, p90_m, blocks, area_m2, bend_m, scale,
         tuple(reasons),
     )  # fmt: skip
@@ -311,10 +316,10 @@ def _judged(
 
 def _blocks(
     a: GaussianCloud, moved: GaussianCloud, row: I64, across_m: F64, matched: NDArray[np.bool_]
-) -> tuple[Block, ...]:
+) -> tuple[AlignmentBlock, ...]:
     """The overlap in squares of 15 m, those in which enough surfaces meet."""
     cell = np.floor(moved.mean_m[row, :2] / _BLOCK_M).astype(np.int64)
-    found = list[Block]()
+    found = list[AlignmentBlock]()
     names, number = np.unique(cell, axis=0, return_inverse=True)
     for k in range(len(names)):
         mine = np.flatnonzero(number.ravel() == k)
@@ -322,7 +327,7 @@ def _blocks(
             continue
         part, good = moved.take(row[mine]), mine[matched[mine]]
         median_m = float(np.median(across_m[good])) if len(good) else float("nan")
-        found.append(Block(part.mean_m[:, :2].mean(axis=0), _residual_shift(a, part), len(mine), median_m))
+        found.append(AlignmentBlock(part.mean_m[:, :2].mean(axis=0), _residual_shift(a, part), len(mine), median_m))
     return tuple(found)
 
 
@@ -345,7 +350,7 @@ def _residual_shift(a: GaussianCloud, part: GaussianCloud) -> F64:
     return shift if is_elsewhere else np.zeros(3)
 
 
-def _bend_m(blocks: tuple[Block, ...]) -> float:
+def _bend_m(blocks: tuple[AlignmentBlock, ...]) -> float:
     """So far off, or less, lie 85 % of the surfaces, each with its block; NaN without blocks."""
     if not blocks:
         return float("nan")
@@ -355,7 +360,7 @@ def _bend_m(blocks: tuple[Block, ...]) -> float:
     return float(shifts[order][np.searchsorted(below, _FIRM_SHARE)])
 
 
-def _scale(blocks: tuple[Block, ...]) -> float:
+def _scale(blocks: tuple[AlignmentBlock, ...]) -> float:
     """By how much B is larger than A in the horizontal, by the shifts of at least four blocks; else NaN."""
     if len(blocks) < 4:
         return float("nan")
@@ -364,7 +369,7 @@ def _scale(blocks: tuple[Block, ...]) -> float:
     return -float((at * np.array([one.shift_m[:2] for one in blocks])).sum() / (at**2).sum())
 
 
-def _covariance(fit: Fit, pivot_m: F64, blocks: tuple[Block, ...]) -> F64:
+def _covariance(fit: Fit, pivot_m: F64, blocks: tuple[AlignmentBlock, ...]) -> F64:
     """(6, 6) at the pivot: of the fit, and beside it what the blocks' disagreement says."""
     x, y, z = pivot_m - fit.centre_m
     lever = np.eye(6)
@@ -380,7 +385,7 @@ def _covariance(fit: Fit, pivot_m: F64, blocks: tuple[Block, ...]) -> F64:
     return np.asarray(covariance)
 
 
-def _overlap_reasons(area_m2: float, score: Score) -> list[str]:
+def _overlap_reasons(area_m2: float, score: FitScore) -> list[str]:
     if area_m2 < MIN_AREA_M2 or score.upright < MIN_UPRIGHT:
         return [_little(area_m2, score.upright)]
     found = list[str]()

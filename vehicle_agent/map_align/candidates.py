@@ -39,14 +39,14 @@ class Reach:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class AlignmentStart:
     """A start for the fit: (4, 4), and the correlation there."""
 
     T_a_b: F64
     correlation: float
 
 
-def candidates(a: GaussianCloud, b: GaussianCloud, pivot_m: F64, reach: Reach, most: int) -> list[Candidate]:
+def candidates(a: GaussianCloud, b: GaussianCloud, pivot_m: F64, reach: Reach, most: int) -> list[AlignmentStart]:
     """The best distinct places of B, best first.
 
     Args:
@@ -72,7 +72,7 @@ def candidates(a: GaussianCloud, b: GaussianCloud, pivot_m: F64, reach: Reach, m
     for one in found:
         if all(np.hypot(one[2] - other[2], one[3] - other[3]) > 2.0 * _CELL_M for other in kept):
             kept.append(one)
-    return [Candidate(_with_height(a, b, pivot_m, reach, *one[1:]), one[0]) for one in kept[:most]]
+    return [AlignmentStart(_with_height(a, b, pivot_m, reach, *one[1:]), one[0]) for one in kept[:most]]
 
 
 def about(pivot_m: F64, heading_rad: float) -> F64:

@@ -74,7 +74,7 @@ class Fit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Score:
+class FitScore:
     """What a pose is worth.
 
     Attributes:
@@ -211,12 +211,12 @@ def gains(a: GaussianCloud, b_moved: GaussianCloud) -> F64:
     return gain
 
 
-def score_of(a: GaussianCloud, b_moved: GaussianCloud) -> Score:
+def score_of(a: GaussianCloud, b_moved: GaussianCloud) -> FitScore:
     """How well B, which was moved, lies on A."""
     known = a.plan_tree.query(b_moved.mean_m[:, :2], distance_upper_bound=_COVER_M)[0] < _COVER_M
     gain = gains(a, b_moved)
     upright, level = b_moved.is_upright & known, b_moved.is_ground & known
-    return Score(
+    return FitScore(
         int(upright.sum()),
         int((gain[upright] > 0).sum()),
         float(gain[upright].sum()),

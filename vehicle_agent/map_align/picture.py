@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise_drive.style import INK, MUTED, new_figure, save_figure
-from gnd.vehicle_agent.map_align.align import Alignment
+from gnd.vehicle_agent.map_align.align import MapAlignment
 from gnd.vehicle_agent.map_align.cloud import GaussianCloud
 
 _A: Final = "#5a6675"
@@ -15,7 +15,7 @@ _B: Final = "#d1433f"
 _SHOWN_M: Final = 80.0
 
 
-def draw_alignment(a: GaussianCloud, b: GaussianCloud, found: Alignment, path: Path) -> None:
+def draw_alignment(a: GaussianCloud, b: GaussianCloud, found: MapAlignment, path: Path) -> None:
     """Draw the upright surfaces of both around the middle of the overlap, where B says it is and where it lies.
 
     Raises:

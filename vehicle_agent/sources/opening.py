@@ -22,7 +22,7 @@ WAITED_NS: Final = 10_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class DriveSource:
     """Measurements of one drive, and what is known of it beforehand.
 
     Attributes:
@@ -41,7 +41,7 @@ class Source:
 
 
 @contextmanager
-def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[Source]:
+def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[DriveSource]:
     """Open the recording, or listen to the sensors until the first position has come.
 
     Raises:
@@ -54,19 +54,19 @@ def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[Source]:
             header, (fix, items) = read_header(config.drive), first_fix(read_drive(config.drive), config.drive)
             header.check_placed()
             items = paced(items, config.pace, stop)
-            yield Source(header, fix, in_common_time(items, config.departure, stop))
+            yield DriveSource(header, fix, in_common_time(items, config.departure, stop))
         else:
             yield _live(config, stop, open_things)
 
 
-def _live(config: AgentConfig, stop: threading.Event, open_things: ExitStack) -> Source:
+def _live(config: AgentConfig, stop: threading.Event, open_things: ExitStack) -> DriveSource:
     warm_up()  # on a fresh machine kernels are compiled for a minute, in which a vehicle that drives would be blind
     if config.live.source == "zenoh":
         from gnd.vehicle_agent.sources.plain_keys import open_plain
 
         plain = open_things.enter_context(open_plain(config.live, config.vehicle, stop))
         fix, items = first_fix(plain.drive(stop, config.live.silent_s), "zenoh", most_ns=WAITED_NS)
-        return Source(_of_this_drive(plain.header, config.vehicle, fix), fix, items, plain.account)
+        return DriveSource(_of_this_drive(plain.header, config.vehicle, fix), fix, items, plain.account)
     from gnd.vehicle_agent.sources.ros2 import open_ros2
 
     ros2 = open_things.enter_context(open_ros2(config.live, config.vehicle, stop))
@@ -81,7 +81,7 @@ def _live(config: AgentConfig, stop: threading.Event, open_things: ExitStack) ->
         deskew="measured" if ros2.has_times else "none",
         mount="given",
     )
-    return Source(_of_this_drive(header, config.vehicle, fix), fix, items, ros2.account, ros2)
+    return DriveSource(_of_this_drive(header, config.vehicle, fix), fix, items, ros2.account, ros2)
 
 
 def _of_this_drive(header: DriveHeader, vehicle: str, fix: GnssFix) -> DriveHeader:

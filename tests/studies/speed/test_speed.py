@@ -14,21 +14,21 @@ from studies.speed import yardstick
 from studies.speed.__main__ import SPARSE, contests, page
 from studies.speed.contest import Absent, Contest, Entrant, raced
 from studies.speed.rays import Walk, placed
-from studies.speed.scene import Scene, SpeedOptions, scene_of
+from studies.speed.scene import SpeedOptions, SpeedScene, scene_of
 
 pytestmark = pytest.mark.slow
 SMALL = SpeedOptions(rounds=1, scans=3, length_m=100.0)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SpeedScene:
     """A short street; of its drive, and of the points on which others match, only a part."""
     whole = scene_of(SMALL, SPARSE, tmp_path_factory.mktemp("speed"))
     return replace(whole, drive=whole.drive[: len(whole.drive) // 3], cloud=whole.cloud[::6])
 
 
 @pytest.mark.skipif(yardstick.compiler() is None, reason="needs gcc")
-def test_the_same_walk_in_c_counts_the_same_to_the_bit(scene: Scene, tmp_path: Path) -> None:
+def test_the_same_walk_in_c_counts_the_same_to_the_bit(scene: SpeedScene, tmp_path: Path) -> None:
     walk = Walk(scene, placed(scene))
     ours, in_c = walk.counts(cast_rays), walk.counts(yardstick.compiled(tmp_path))
     for a, b in zip(ours, in_c, strict=True):
@@ -36,7 +36,9 @@ def test_the_same_walk_in_c_counts_the_same_to_the_bit(scene: Scene, tmp_path: P
     assert (ours.words[:, 12:].sum(axis=0) > 100).all(), "all four cases were counted"
 
 
-def test_the_result_of_who_walks_wrongly_says_so(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_of_who_walks_wrongly_says_so(
+    scene: SpeedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = tmp_path / "wrong.c"
     source.write_text(yardstick.SOURCE.read_text().replace("state[at] = (int32_t)(row - 1)", "state[at] = row"))
     monkeypatch.setattr(yardstick, "SOURCE", source)
@@ -46,7 +48,7 @@ def test_the_result_of_who_walks_wrongly_says_so(scene: Scene, tmp_path: Path, m
 
 
 def test_every_contest_runs_and_its_page_has_a_row_for_everybody(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: SpeedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("studies.speed.__main__.scene_of", lambda *_: scene)
     sheets = [raced(contest, 1) for contest in contests(SMALL, tmp_path)]

@@ -29,7 +29,7 @@ class Topic:
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class BagMessage:
     """A message as recorded: its bytes, and where it lies: file, log time, how many of the topic with this log time
     come before it.
     """
@@ -112,7 +112,7 @@ class Bag:
                 counts[one.topic, one.msgtype] = counts.get((one.topic, one.msgtype), 0) + one.msgcount
         return tuple(Topic(name, kind, n) for (name, kind), n in sorted(counts.items()))
 
-    def messages(self, topics: Sequence[str]) -> Iterator[Message]:
+    def messages(self, topics: Sequence[str]) -> Iterator[BagMessage]:
         """The messages of some topics, file by file, in the order of their log times.
 
         Raises:
@@ -128,7 +128,7 @@ class Bag:
                     before = last.get(connection.topic, (-1, -1))
                     nth = before[1] + 1 if before[0] == log_ns else 0
                     last[connection.topic] = log_ns, nth
-                    yield Message(connection.topic, number, int(log_ns), nth, bytes(data))
+                    yield BagMessage(connection.topic, number, int(log_ns), nth, bytes(data))
 
     def again(self, topic: str, file: int, log_ns: int, nth: int) -> bytes:
         """The bytes of a message that was met before."""

@@ -54,7 +54,7 @@ CLOCKS_NS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class _At:
+class _CloudAt:
     """Where a cloud lies in the bag, when it was stamped, and in which frame."""
 
     file: int
@@ -123,16 +123,16 @@ def cloud_topic(bag: Bag, wanted: str | None) -> str:
     return found[0]
 
 
-def _index(bag: Bag, topic: str) -> list[_At]:
+def _index(bag: Bag, topic: str) -> list[_CloudAt]:
     found = []
     for message in bag.messages([topic]):
         stamp_ns, frame = head_of(f"{bag.place}: {topic}", message.data)
         stamp_ns = stamp_ns if stamp_ns > STAMPED_NS else message.log_ns
-        found.append(_At(message.file, message.log_ns, message.nth, stamp_ns, frame.lstrip("/")))
+        found.append(_CloudAt(message.file, message.log_ns, message.nth, stamp_ns, frame.lstrip("/")))
     return found
 
 
-def _in_time_order(clouds: list[_At]) -> tuple[list[_At], tuple[str, ...]]:
+def _in_time_order(clouds: list[_CloudAt]) -> tuple[list[_CloudAt], tuple[str, ...]]:
     """Clouds by their stamps, each stamp once; and what had to be done for that."""
     notes, kept = [], sorted(clouds, key=lambda at: at.stamp_ns)
     if (late := sum(a.stamp_ns > b.stamp_ns for a, b in pairwise(clouds))) > 0:
@@ -146,7 +146,7 @@ def _in_time_order(clouds: list[_At]) -> tuple[list[_At], tuple[str, ...]]:
     return once, tuple(notes)
 
 
-def _one_frame(place: Path, topic: str, clouds: list[_At]) -> str:
+def _one_frame(place: Path, topic: str, clouds: list[_CloudAt]) -> str:
     frames = Counter(at.frame for at in clouds)
     if len(frames) > 1:
         held = ", ".join(f"{n} in {frame}" for frame, n in frames.most_common())
@@ -159,7 +159,7 @@ def _odometry_frames(bag: Bag, small: Small) -> list[str]:
     return [messages[0][1].child_frame_id for name, messages in small.by_topic.items() if kinds[name] == ODOMETRY]
 
 
-def _time_rule(bag: Bag, topic: str, clouds: list[_At], choices: Choices) -> tuple[TimeRule, NDArray[np.void]]:
+def _time_rule(bag: Bag, topic: str, clouds: list[_CloudAt], choices: Choices) -> tuple[TimeRule, NDArray[np.void]]:
     """How times of points are read, and the points of the first cloud that has any."""
     points = np.zeros(0, [("x", "f4"), ("y", "f4"), ("z", "f4")])
     for at in clouds[:20]:
@@ -182,7 +182,7 @@ def _shift(points: NDArray[np.void], stamp_ns: int, rule: TimeRule) -> tuple[int
     return begin_ns - stamp_ns, ()
 
 
-def _read(bag: Bag, topic: str, at: _At, rule: TimeRule) -> RawScan:
+def _read(bag: Bag, topic: str, at: _CloudAt, rule: TimeRule) -> RawScan:
     data = bag.again(topic, at.file, at.log_ns, at.nth)
     return scan_of_fields(decode_cloud(f"{bag.place}: cloud at {at.stamp_ns} ns", data).points, at.stamp_ns, rule)
 

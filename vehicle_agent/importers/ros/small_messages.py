@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gnd.schemas.drive import GnssFix, MotionSample
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M
-from gnd.vehicle_agent.importers.ros.bag import Bag, Message, Topic
+from gnd.vehicle_agent.importers.ros.bag import Bag, BagMessage, Topic
 from gnd.vehicle_agent.importers.ros.transforms import StaticTransforms, T_of_pose
 from gnd.vehicle_agent.importers.trajectories.guesses import coordinates_of, looks_like_camera
 from gnd.vehicle_agent.importers.trajectories.pose_table import PoseTable
@@ -58,7 +58,7 @@ def read_small(bag: Bag) -> Small:
     return small
 
 
-def stamp_of(header: Any, message: Message) -> int:
+def stamp_of(header: Any, message: BagMessage) -> int:
     """When it was measured; when it was recorded, where the clock of the sensor was not set."""
     stamp = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
     return stamp if stamp > STAMPED_NS else message.log_ns
