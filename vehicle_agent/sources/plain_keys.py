@@ -64,7 +64,7 @@ class PlainSource:
         self._stream_of = {
             live_key(vehicle, topic): (SCANS if topic == POINTS_TOPIC else topic.strip("/"), topic) for topic in topics
         }
-        streams = sorted((stream for stream, _ in self._stream_of.values()), key=lambda stream: stream == SCANS)
+        streams = sorted((stream for stream, _ in self._stream_of.values()), key=lambda stream: stream != SCANS)
         self.items = LiveItems(streams)
         self._subscription: Subscription = bus.subscribe(live_key(vehicle, "*"), self._take, kind="control")
 

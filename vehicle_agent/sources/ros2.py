@@ -68,11 +68,11 @@ class RosSource:
         self._frames = StaticTransforms()
         self._scans: RosScans | None = None
         self._motion = RosMotion(topics.speed_kind)
-        streams = {
+        streams = {  # of equal stamps in this order, as a drive is read from its file
+            SCANS: (topics.points, CLOUD),
             SPEED: (topics.speed, topics.speed_kind),
             GYRO: (topics.imu, IMU),
             GNSS: (topics.gnss, FIX),
-            SCANS: (topics.points, CLOUD),
         }
         streams = {stream: (topic, kind) for stream, (topic, kind) in streams.items() if topic}
         self.items = LiveItems(list(streams))
