@@ -166,7 +166,9 @@ def test_a_slow_subscriber_keeps_the_newest_and_counts_the_rest(router: str) -> 
         assert wait_for(lambda: subscription.dropped >= 7)
         go_on.set()
         assert wait_for(lambda: got[-1:] == [10])
-        assert (subscription.dropped, subscription.lost, got[1:]) == (7, 0, [9, 10])
+        assert got[-2:] == [9, 10]
+        assert len(got) in (2, 3)  # the first, where it was taken before the others came
+        assert (subscription.dropped, subscription.lost) == (10 - len(got), 0)
 
 
 def test_a_gap_in_the_numbers_is_counted_as_lost(router: str) -> None:
