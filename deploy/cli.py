@@ -34,7 +34,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive.",
     ),
     "localise": ("gnd.vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
-    "play": ("gnd.deploy.play:play_command", "Publish a recording as a vehicle's drivers would, on topics of ROS 2."),
+    "play": ("gnd.deploy.play:play_command", "Publish a recording as sensors would: ROS 2 topics, or plain keys."),
     "config": ("gnd.deploy.config_cli:config", "Show and check the settings of the programs."),
     "sim": ("gnd.fleet_sim.cli:sim", "Write and inspect simulated worlds and drives."),
     "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and compare them with ours."),

@@ -68,6 +68,8 @@ def build(
     show(values, as_json, lambda console: _print(console, f"{path}, layer {layer}", values))
     if report is not None and not as_json:
         click.echo(f"page written: {report}")
+    if not as_json:
+        click.echo(f"next: gnd fleet --drives FOLDER --map {path} with later drives: they heal it")
 
 
 def _print(console: Console, title: str, values: dict[str, Any]) -> None:

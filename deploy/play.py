@@ -206,6 +206,8 @@ def play_command(
     """
     if on is None:
         raise click.UsageError("on what: --ros2 or --zenoh?")
+    if not recording.exists():
+        raise ImportDriveError(f"no recording at {recording}")
     logging.basicConfig(level=logging.ERROR, format="%(asctime)s %(name)s %(message)s")
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -226,8 +228,6 @@ def messages_of(recording: Path) -> Iterator[Played]:
         ImportDriveError: it is neither.
         DriveError: a drive that is damaged.
     """
-    if not recording.exists():
-        raise ImportDriveError(f"no recording at {recording}")
     try:
         header = read_header(recording)
     except DriveError:
