@@ -109,6 +109,13 @@ def test_times_that_cannot_be_end_the_drive(shift_ns: int, message: str) -> None
         list(items.drive(NEVER, silent_s=1.0))
 
 
+def test_a_clock_that_nobody_has_set_ends_the_drive() -> None:
+    items = LiveItems([SCANS])
+    items.put(SCANS, 12 * S, lambda: scan(12 * S))
+    with pytest.raises(LiveError, match=r"stamped 12\.000 s after 1970: nobody has set its clock"):
+        list(items.drive(NEVER, silent_s=1.0))
+
+
 def test_clocks_that_differ_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
     items, now_ns = LiveItems([SCANS, "odometry"]), time.time_ns()
     for i in range(5):
@@ -180,6 +187,23 @@ def test_a_gyro_that_is_turned_gives_the_rate_about_the_vehicles_vertical() -> N
     assert motion.gyro(rate(S + 900 * ms, -0.35)) is None  # a gap
     plain = RosMotion(ODOMETRY)
     assert plain.twist(speed(S)) == MotionSample(S, 7.0, 9.9)
+
+
+def test_an_odometry_without_speeds_ends_the_drive() -> None:
+    """Some drivers fill the pose alone: a vehicle that believed them would stand."""
+
+    def at(x: float, speed: float) -> bytes:
+        values = {"header": header(S, "odom"), "pose": {"pose": {"position": {"x": x}}}}
+        return encode(ODOMETRY, values | {"twist": {"twist": {"linear": {"x": speed}}}})
+
+    motion = RosMotion(ODOMETRY)
+    assert motion.twist(at(5.0, 0.0)) == MotionSample(S, 0.0, 0.0)
+    assert motion.twist(at(5.9, 0.0)) == MotionSample(S, 0.0, 0.0)
+    with pytest.raises(LiveError, match=r"twist is zero although its poses have moved by 1\.1 m.*live\.speed"):
+        motion.twist(at(6.1, 0.0))
+    drives = RosMotion(ODOMETRY)
+    drives.twist(at(0.0, 3.0))
+    assert drives.twist(at(9.0, 0.0)) == MotionSample(S, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_what_arrives_is_what_was_recorded(endpoint: str, recordings: Path) -> N
     recording, live = recordings / "probe.mcap", LiveParameters(source="ros2", connect=(endpoint,))
     playing = played(endpoint, recording)
     with open_ros2(live, "car-1", NEVER) as source:
-        arrived = list(source.drive(NEVER, silent_s=1.0))
+        arrived = list(source.items.drive(NEVER, silent_s=1.0))
         account = source.account()
     playing.join()
     kept = [item for item in read_drive(recording) if isinstance(item, Scan | MotionSample | GnssFix)]
@@ -153,7 +153,7 @@ def test_a_bag_that_is_played_gives_what_its_import_gives(endpoint: str, recordi
             writer.write(connections[name], message.sent_ns, message.payload)
     playing = played(endpoint, bag)
     with open_ros2(LiveParameters(source="ros2", connect=(endpoint,)), "car-1", NEVER) as source:
-        arrived = list(source.drive(NEVER, silent_s=1.0))
+        arrived = list(source.items.drive(NEVER, silent_s=1.0))
     playing.join()
     recording = open_ros(bag, None)
     scans = [item for item in arrived if isinstance(item, Scan)]
@@ -224,7 +224,7 @@ def test_plain_keys_carry_a_drive_as_it_is(endpoint: str, recordings: Path) -> N
     playing = threading.Thread(target=run)
     playing.start()
     with open_plain(live, "car-1", NEVER) as source:
-        arrived = list(source.drive(NEVER, silent_s=1.0))
+        arrived = list(source.items.drive(NEVER, silent_s=1.0))
         account = source.account()
     playing.join()
     kept = [item for item in read_drive(recording) if isinstance(item, Scan | MotionSample | GnssFix)]

@@ -1,5 +1,6 @@
 """What whoever imports a recording may decide instead of the reader: options as text, and what they mean."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -71,9 +72,7 @@ def anchor_of_text(text: str) -> RecordingAnchor:
 
 
 def mount_of_text(text: str) -> F64:
-    """(4, 4) T_vehicle_lidar of X,Y,Z,ROLL,PITCH,YAW in metres and degrees, or of a file with 12 or 16 numbers.
-
-    The rotation is R_z(yaw) R_y(pitch) R_x(roll), as in ROS.
+    """(4, 4) T_vehicle_lidar of X,Y,Z,ROLL,PITCH,YAW (`mount_of_numbers`), or of a file with 12 or 16 numbers.
 
     Raises:
         ImportDriveError: neither, or a matrix that is no rotation.
@@ -85,9 +84,7 @@ def mount_of_text(text: str) -> F64:
     except ValueError:
         values = np.zeros(0)
     if len(values) == 6 and not path.is_file():
-        roll, pitch, yaw = np.radians(values[3:])
-        R = exp_so3([0.0, 0.0, yaw]) @ exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0])
-        return T_from_R_t(R, values[:3])
+        return mount_of_numbers(values)
     if len(values) in (12, 16) and path.is_file():
         T, _ = orthonormal(values.reshape(-1, 4)[None, :3], f"--mount {text}")
         return np.asarray(T[0])
@@ -95,6 +92,16 @@ def mount_of_text(text: str) -> F64:
         f"--mount {text!r}: expected X,Y,Z,ROLL,PITCH,YAW in metres and degrees, such as 1.2,0,1.9,0,0,0, or a file"
         " with the 12 or 16 numbers of T_vehicle_lidar"
     )
+
+
+def mount_of_numbers(values: Sequence[float] | F64) -> F64:
+    """(4, 4) T_vehicle_lidar of x, y, z in m and roll, pitch, yaw in degrees.
+
+    The rotation is R_z(yaw) R_y(pitch) R_x(roll), as in ROS.
+    """
+    roll, pitch, yaw = np.radians(values[3:])
+    R = exp_so3([0.0, 0.0, yaw]) @ exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0])
+    return T_from_R_t(R, values[:3])
 
 
 def fields_of_text(text: str) -> FieldChoice:

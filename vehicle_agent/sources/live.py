@@ -15,6 +15,7 @@ from gnd.schemas.drive import DriveItem
 from gnd.schemas.errors import BadValue
 from gnd.schemas.limits import MAX_AHEAD_NS
 from gnd.vehicle_agent.errors import ImportDriveError, VehicleError
+from gnd.vehicle_agent.importers.ros.small_messages import STAMPED_NS
 from gnd.vehicle_agent.sources.ros2_messages import BadRosMessage
 from gnd.vehicle_agent.sources.stamp_order import StampOrder
 
@@ -55,13 +56,13 @@ class LiveItems:
 
     Attributes:
         received: messages by stream.
-        left_out: scans for which there was no time.
+        left_out: by stream, for which there was no time: scans, and others only where very many wait.
         unreadable: messages by stream that were not what their type says.
     """
 
     def __init__(self, streams: Sequence[str]) -> None:
         self.received: Counter[str] = Counter()
-        self.left_out = 0
+        self.left_out: Counter[str] = Counter()
         self.unreadable: Counter[str] = Counter()
         self._order: StampOrder[_Waiting] = StampOrder(streams)
         self._ripe: deque[_Waiting] = deque()
@@ -100,7 +101,7 @@ class LiveItems:
             silent_s: it also ends once nothing has come for so long; 0: never.
 
         Raises:
-            LiveError: time went back, or stamps lie in the future.
+            LiveError: time went back, stamps lie in the future, or before 1973.
         """
         heard_s = time.monotonic()
         while not stop.is_set():
@@ -125,7 +126,8 @@ class LiveItems:
         with self._changed:
             return {
                 "received": dict(self.received),
-                "scans_left_out": self.left_out,
+                "scans_left_out": self.left_out[SCANS],
+                "others_left_out": self.left_out.total() - self.left_out[SCANS],
                 "late": {stream: n for stream, n in self._order.late.items() if n},
                 "unreadable": dict(self.unreadable),
                 "clock_offset_s": {stream: round(offset * 1e-9, 3) for stream, offset in self._offset_ns.items()},
@@ -137,7 +139,7 @@ class LiveItems:
         if scans > MOST_SCANS or len(self._ripe) > MOST_OTHERS:
             oldest = next(w for w in self._ripe if w.stream == SCANS or scans <= MOST_SCANS)
             self._ripe.remove(oldest)
-            self.left_out += oldest.stream == SCANS
+            self.left_out[oldest.stream] += 1
 
     def _read(self, waiting: _Waiting) -> DriveItem | None:
         try:
@@ -147,6 +149,8 @@ class LiveItems:
             return None
 
     def _check_time(self, stream: str, t_ns: int) -> None:
+        if t_ns < STAMPED_NS:
+            self._problem = LiveError(f"{stream}: stamped {t_ns * 1e-9:.3f} s after 1970: nobody has set its clock")
         newest_ns = self._newest_ns.get(stream, t_ns)
         if t_ns < newest_ns - BACK_NS:
             self._problem = LiveError(

@@ -12,7 +12,6 @@ from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.sources.recording import first_fix, paced
 from gnd.vehicle_agent.sources.world_clock import in_common_time
-from gnd.vehicle_agent.warm import warm_up
 
 if TYPE_CHECKING:
     from gnd.vehicle_agent.sources.ros2 import RosSource
@@ -60,17 +59,20 @@ def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[DriveSou
 
 
 def _live(config: AgentConfig, stop: threading.Event, open_things: ExitStack) -> DriveSource:
+    from gnd.vehicle_agent.warm import warm_up  # loads every part of a vehicle
+
     warm_up()  # on a fresh machine kernels are compiled for a minute, in which a vehicle that drives would be blind
     if config.live.source == "zenoh":
         from gnd.vehicle_agent.sources.plain_keys import open_plain
 
         plain = open_things.enter_context(open_plain(config.live, config.vehicle, stop))
-        fix, items = first_fix(plain.drive(stop, config.live.silent_s), "zenoh", most_ns=WAITED_NS)
+        fix, items = first_fix(plain.items.drive(stop, config.live.silent_s), "zenoh", most_ns=WAITED_NS)
         return DriveSource(_of_this_drive(plain.header, config.vehicle, fix), fix, items, plain.account)
     from gnd.vehicle_agent.sources.ros2 import open_ros2
 
     ros2 = open_things.enter_context(open_ros2(config.live, config.vehicle, stop))
-    fix, items = first_fix(ros2.drive(stop, config.live.silent_s), f"ROS 2, {ros2.topics.gnss}", most_ns=WAITED_NS)
+    measured = ros2.items.drive(stop, config.live.silent_s)
+    fix, items = first_fix(measured, f"ROS 2, {ros2.topics.gnss}", most_ns=WAITED_NS)
     header = DriveHeader(
         drive_id="live",
         vehicle=config.vehicle,

@@ -16,7 +16,7 @@ from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusError, NoRouter
 from gnd.fleet_bus.subscribing import Subscription
-from gnd.schemas.drive import DriveHeader, DriveItem
+from gnd.schemas.drive import DriveHeader
 from gnd.schemas.drive_mcap import ITEM_TOPICS, POINTS_TOPIC, item_of
 from gnd.schemas.drive_metadata import header_of, metadata_of
 from gnd.schemas.errors import BadValue, SchemaError
@@ -67,10 +67,6 @@ class PlainSource:
         streams = sorted((stream for stream, _ in self._stream_of.values()), key=lambda stream: stream != SCANS)
         self.items = LiveItems(streams)
         self._subscription: Subscription = bus.subscribe(live_key(vehicle, "*"), self._take, kind="control")
-
-    def drive(self, stop: threading.Event, silent_s: float) -> Iterator[DriveItem]:
-        """Measurements in the order of their times; see `LiveItems.drive`."""
-        return self.items.drive(stop, silent_s)
 
     def account(self) -> dict[str, Any]:
         """What came and what did not, as plain values."""

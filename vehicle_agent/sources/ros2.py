@@ -16,10 +16,11 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import NoRouter
 from gnd.fleet_bus.ros2 import LATCHED_QOS, RosEndpoint, RosMessage, RosNode, RosQos, RosTopic, publishers_of
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.se3 import exp_so3
 from gnd.schemas.drive import DriveItem
 from gnd.vehicle_agent.config import LiveParameters
-from gnd.vehicle_agent.importers.point_cloud2 import head_of
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.choices import mount_of_numbers
+from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud, head_of
 from gnd.vehicle_agent.importers.ros.small_messages import SPEEDS
 from gnd.vehicle_agent.importers.ros.transforms import StaticTransforms
 from gnd.vehicle_agent.sources.live import ROUTER_WAIT_S, SCANS, LiveError, LiveItems
@@ -89,10 +90,6 @@ class RosSource:
         """Whether the clouds tell the times of their points."""
         return self._scans is not None and self._scans.rule.field is not None
 
-    def drive(self, stop: threading.Event, silent_s: float) -> Iterator[DriveItem]:
-        """Measurements in the order of their stamps; see `LiveItems.drive`."""
-        return self.items.drive(stop, silent_s)
-
     def account(self) -> dict[str, Any]:
         """What came and what did not, as plain values."""
         lost = {one.topic.name: one.lost + one.dropped for one in self._subscriptions if one.lost + one.dropped}
@@ -110,17 +107,27 @@ class RosSource:
             if stop.wait(_LOOK_S):
                 raise LiveError(f"stopped before anything came of {', '.join(sorted(missing))}")
         self._scans = RosScans(self.topics.points, self._first[SCANS])
-        self.T_vehicle_lidar = mount_of(live.mount) if live.mount else self._wait_frame(live, self._scans.frame, stop)
+        given = mount_of_numbers(live.mount) if live.mount else None
+        self.T_vehicle_lidar = self._wait_frame(live, self._scans.frame, stop) if given is None else given
         if self.topics.imu:
             imu = decode(IMU, self._first[GYRO]).header.frame_id
             self._motion = RosMotion(self.topics.speed_kind, self._wait_frame(live, imu, stop)[:3, :3])
 
     def _put(self, stream: str, message: RosMessage) -> None:
-        self._first.setdefault(stream, message.payload)
-        t_ns, _ = head_of(message.topic, message.payload)
+        try:
+            t_ns, _ = head_of(message.topic, message.payload)
+            if stream not in self._first and self._shows(stream, message):
+                self._first[stream] = message.payload
+        except ImportDriveError as error:
+            self.items.refuse(stream, error)
+            return
         if stream == SCANS and self._scans is not None:
             t_ns += self._scans.shift_ns
         self.items.put(stream, t_ns, lambda: self._read(stream, message.payload))
+
+    def _shows(self, stream: str, message: RosMessage) -> bool:
+        """Whether a message can be the first: how times of points are counted, a cloud without points does not show."""
+        return stream != SCANS or len(decode_cloud(message.topic, message.payload).points) > 0
 
     def _read(self, stream: str, data: bytes) -> DriveItem | None:
         """The measurement of a message; called once `wait_ready` has come back."""
@@ -220,12 +227,3 @@ def _only(live: LiveParameters, name: str, kinds: tuple[str, ...], found: list[R
             f"{len(topics)} topics could be meant ({', '.join(topics)}): choose with --set live.{name}=/TOPIC"
         )
     return named or topics[0]
-
-
-def mount_of(mount: tuple[float, ...]) -> F64:
-    """(4, 4) T_vehicle_lidar of x, y, z in m and roll, pitch, yaw in degrees, turned about x, then y, then z."""
-    T = np.eye(4)
-    roll, pitch, yaw = np.radians(mount[3:])
-    T[:3, :3] = exp_so3([0, 0, yaw]) @ exp_so3([0, pitch, 0]) @ exp_so3([roll, 0, 0])
-    T[:3, 3] = mount[:3]
-    return T

@@ -1,5 +1,6 @@
 """What messages of ROS 2 measure, by the rules of the import: the same bytes give the same values."""
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -10,8 +11,10 @@ from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.fields import TimeRule, scan_of_fields, time_rule, times_of
 from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud
 from gnd.vehicle_agent.importers.ros.small_messages import TWIST, fixes_of_topic
-from gnd.vehicle_agent.sources.ros2_messages import FIX, IMU, decode, stamp_of
+from gnd.vehicle_agent.sources.live import LiveError
+from gnd.vehicle_agent.sources.ros2_messages import FIX, IMU, ODOMETRY, decode, stamp_of
 
+MOVED_M: Final = 1.0
 STALE_NS: Final = 200_000_000
 """A gyro's rate this far from a speed says nothing about it."""
 
@@ -62,16 +65,35 @@ class RosMotion:
         self._kind, self._R = kind, R_vehicle_imu
         self._gyro: tuple[int, float] | None = None
         self._speed: tuple[int, float] | None = None
+        self._began_at: Any = None
+        """Position of the first odometry, until a speed was not zero."""
+        self._has_speed = kind != ODOMETRY
 
     def twist(self, data: bytes) -> MotionSample | None:
-        """Take a message with a twist; with a gyro its sample comes with the gyro's next one."""
+        """Take a message with a twist; with a gyro its sample comes with the gyro's next one.
+
+        Raises:
+            LiveError: an odometry's twist is zero although its poses move: it does not fill it.
+        """
         message: Any = decode(self._kind, data)
         twist = message.twist if self._kind == TWIST else message.twist.twist
         speed_mps, t_ns = float(twist.linear.x), stamp_of(message)
+        self._has_speed = self._has_speed or speed_mps != 0.0
+        if not self._has_speed:
+            self._check_stands(message.pose.pose.position)
         if self._R is None:
             return MotionSample(t_ns, speed_mps, float(twist.angular.z))
         self._speed = t_ns, speed_mps
         return None
+
+    def _check_stands(self, position: Any) -> None:
+        self._began_at = self._began_at or position
+        way_m = math.hypot(position.x - self._began_at.x, position.y - self._began_at.y)
+        if way_m > MOVED_M:
+            raise LiveError(
+                f"the odometry's twist is zero although its poses have moved by {way_m:.1f} m: it does not tell the"
+                " speed; choose another topic with --set live.speed=/TOPIC"
+            )
 
     def gyro(self, data: bytes) -> MotionSample | None:
         """Take an Imu: the speed before it gets the rate at its time, between this sample and the one before."""

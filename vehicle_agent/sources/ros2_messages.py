@@ -11,14 +11,16 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import quaternion_xyzw_from_R
 from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.importers import point_cloud2
 from gnd.vehicle_agent.importers.optional import library
+from gnd.vehicle_agent.importers.ros import small_messages
 
-CLOUD: Final = "sensor_msgs/msg/PointCloud2"
-IMU: Final = "sensor_msgs/msg/Imu"
-FIX: Final = "sensor_msgs/msg/NavSatFix"
-ODOMETRY: Final = "nav_msgs/msg/Odometry"
-TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
-POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+CLOUD: Final = point_cloud2.SCHEMA
+IMU: Final = small_messages.IMU
+FIX: Final = small_messages.NAV_SAT_FIX
+ODOMETRY: Final = small_messages.ODOMETRY
+TRANSFORMS: Final = small_messages.TF
+POSE: Final = small_messages.POSE_COVARIANCE
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 NS_PER_S: Final = 1_000_000_000
 _FIELD_CODES: Final = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
