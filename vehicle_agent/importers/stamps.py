@@ -18,7 +18,8 @@ class Stamped(Protocol):
     """Where a cloud lies, and when it was stamped."""
 
     @property
-    def stamp_ns(self) -> int: ...
+    def stamp_ns(self) -> int:
+        """UTC."""
 
 
 At = TypeVar("At", bound=Stamped)

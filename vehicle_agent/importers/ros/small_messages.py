@@ -92,8 +92,8 @@ def motion_of_topic(
     """Speed and yaw rate of a topic that gives speed; the yaw rate of an IMU where the topic gives none.
 
     Returns:
-        The samples, none where the topic's twists are all zero although poses move or no turn rate is near them, and the
-        sentence that says so.
+        The samples, none where the topic's twists are all zero although poses move or no turn rate is near them, and
+        the sentence that says so.
     """
     twist: Callable[[Any], Any] = (lambda one: one.twist) if kind == TWIST else (lambda one: one.twist.twist)
     twists = {t: (float(twist(one).linear.x), float(twist(one).angular.z)) for t, one in messages}
