@@ -15,9 +15,8 @@ from mcap.summary import Summary
 
 from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import GnssFix, MotionSample
-from gnd.schemas.drive_mcap import POINTS_TOPIC, load_track, read_header
+from gnd.schemas.drive_mcap import POINTS_TOPIC, is_drive, load_track, read_header
 from gnd.schemas.drive_messages import ns_of
-from gnd.schemas.drive_metadata import METADATA
 from gnd.schemas.errors import DriveError
 from gnd.schemas.mcap_file import open_mcap
 from gnd.vehicle_agent.errors import ImportDriveError
@@ -57,7 +56,7 @@ def open_mcap_clouds(place: Path, anchor: RecordingAnchor | None, topic: str | N
     paths = _paths(place)
     if not paths:
         raise ImportDriveError(f"{place}: no .mcap file there")
-    if len(paths) == 1 and _is_own_drive(paths[0]):
+    if len(paths) == 1 and is_drive(paths[0]):
         return _own_drive(paths[0])
     chosen, schema = _topic(paths, topic)
     clouds, notes = in_time_order([at for path in paths for at in _index(path, chosen)])
@@ -84,16 +83,11 @@ def is_foxglove_or_own(place: Path) -> bool:
     for path in _paths(place):
         try:
             with open_mcap(path) as (_, summary):
-                if _cloud_topics(summary) or _is_own_drive(path):
+                if _cloud_topics(summary) or is_drive(path):
                     return True
         except DriveError:
             continue
     return False
-
-
-def _is_own_drive(path: Path) -> bool:
-    with open_mcap(path) as (reader, _):
-        return any(record.name == METADATA for record in reader.iter_metadata())
 
 
 def _own_drive(path: Path) -> Recording:
