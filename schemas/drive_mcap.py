@@ -255,6 +255,12 @@ def read_header(path: Path | str) -> DriveHeader:
         return header_of(metadata, _mount_of(reader))
 
 
+def is_drive(path: Path | str) -> bool:
+    """Whether an MCAP file is a drive; `DriveError` when it cannot be read."""
+    with open_mcap(Path(path)) as (reader, _):
+        return any(record.name == METADATA for record in reader.iter_metadata())
+
+
 def read_drive(path: Path | str) -> Iterator[DriveItem]:
     """Scans, motion samples, GNSS fixes, reference poses and looks in time order, some seconds of them in memory.
 

@@ -326,6 +326,21 @@ def test_velodyne_captures(shared_data):
     assert any("cut off by the capture" in note for note in hdl32.notes)
 
 
+def test_a_damaged_capture_says_that_the_rest_is_left_out(shared_data, tmp_path):
+    """A packet that says it is of another model."""
+    data = bytearray((shared_data / "captures_a" / "sample_velodyne_vlp16_gps.pcap").read_bytes())
+    damaged, end = tmp_path / "a.pcap", 24
+    while end < 0.9 * len(data) or data[end - 1] != 0x22:  # a VLP-16's packets end so
+        end += 16 + int.from_bytes(data[end + 8 : end + 12], "little")
+    data[end - 1] = 0xEB
+    damaged.write_bytes(data)
+    recording = open_recording("auto", damaged, ANCHOR)
+    assert 2 <= len(recording) < 4
+    assert any(note.startswith("damaged after") for note in recording.notes)
+    with pytest.raises(ImportDriveError, match=r"a\.pcap: "):
+        open_recording("auto", damaged, ANCHOR, choices=Choices(strict=True))
+
+
 def test_a_capture_of_another_sensor_says_what_to_do(shared_data, tmp_path):
     with pytest.raises(ImportDriveError, match=r"no packets of a Velodyne .*64 of 8448 bytes.*ouster-cli source"):
         open_recording("auto", shared_data / "captures_a" / "OS-0-128-U1_v2.3.0_1024x10.pcap")

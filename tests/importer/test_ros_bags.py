@@ -61,7 +61,6 @@ SENSORS = {
     "milliseconds": ([("time", "<f4")], 0.0, lambda k: OFFSET * 1e3),
     "64 bits": ([("timestamp", "<f8")], 0.5, lambda k: since_1970(k) * 1e6),
 }
-LIDAR = transforms(START, ("base_link", "lidar", (1.2, 0.0, 1.8), (0.0, 0.0, 0.0, 1.0)))
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -218,6 +217,24 @@ def test_speed_of_wheels_and_turn_rate_of_an_imu(tmp_path):
     recording = open_recording("auto", write_bag(tmp_path / "bag", made))
     assert [sample.speed_mps for sample in recording.motion] == [7.0] * 4
     np.testing.assert_allclose([sample.yaw_rate_radps for sample in recording.motion], 0.3, atol=1e-12)
+
+
+@pytest.mark.parametrize(("imus", "kept"), [((0, 1, 2), [0, 1, 2, 3, 4]), ((0, 9), [0, 1, 2, 7, 8, 9]), ((30,), [])])
+def test_speeds_far_from_any_turn_rate_are_left_out(tmp_path, imus, kept):
+    """An IMU that was recorded for a part of the way: its last rate is not held, and no line is drawn over the gap."""
+    made = [("/tf_static", START, transforms(START, ("base_link", "imu", (0, 0, 0), (0, 0, 0, 1))))]
+    for k in range(10):
+        made.append(("/points", START + k * STEP, cloud(points([]), START + k * STEP)))
+        made.append(("/wheels", START + k * STEP, odometry(START + k * STEP, (k, 0, 0), (0, 0, 0, 1), 7.0, 0.0)))
+    made += [("/imu", START + k * STEP, imu(START + k * STEP, (0.0, 0.0, 0.3))) for k in imus]
+    recording = open_recording("auto", write_bag(tmp_path / "bag", sorted(made, key=lambda one: one[1])))
+    assert [(sample.t_ns - START) // STEP for sample in recording.motion] == kept
+    used = {one.name: (one.used, one.why) for one in recording.entries}
+    if kept:
+        assert used["/imu"][0] == "yaw rate"
+        assert f"/wheels: {10 - len(kept)} speeds without a number or without a turn rate" in " ".join(recording.notes)
+    else:
+        assert used["/wheels"] == ("", "no turn rate of the IMU near its times")
 
 
 def test_fixes_without_a_position_and_without_a_covariance(tmp_path):

@@ -20,6 +20,7 @@ from gnd.schemas.trajectory_files import tum_text
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import import_recording, open_recording
 from gnd.vehicle_agent.importers.choices import Choices
+from gnd.vehicle_agent.importers.quality import quality_of
 from gnd.vehicle_agent.importers.recording import RecordingAnchor
 from gnd.vehicle_agent.importers.trajectories.clocks import leap_seconds, ns_of_date, ns_of_gps, ns_of_number
 from gnd.vehicle_agent.importers.trajectories.frames import ecef_poses, in_map, with_frame
@@ -276,6 +277,21 @@ def test_the_real_poses_of_a_slam_and_of_kitti(shared_data):
     kitti = read_poses(shared_data / "kitti00_start16" / "KITTI_00_gt.txt")
     assert (len(kitti), kitti.camera, len(kitti.t_ns)) == (16, True, 16)
     assert any("off by up to 2.1e-07" in note for note in kitti.notes)
+
+
+def test_the_way_is_that_of_the_scans_not_of_longer_poses(kitti_folder, tmp_path):
+    """Poses of 100 m before and after the scans are no way that was scanned."""
+    T, t_ns = way(), START + np.arange(8) * SECOND // 10
+    before, after = T[:1].copy(), T[-1:].copy()
+    before[0, 0, 3] -= 100.0
+    after[0, 0, 3] += 100.0
+    longer = Trajectory(np.r_[t_ns[0] - SECOND // 2, t_ns, t_ns[-1] + SECOND // 2], np.concatenate([before, T, after]))
+    (tmp_path / "poses").write_text(tum_text(longer))
+    choices = Choices(poses=str(tmp_path / "poses"), anchor=ANCHOR, poses_of="vehicle")
+    recording = open_recording("auto", kitti_folder, choices=choices)
+    assert len(recording) == 8
+    quality = quality_of(recording, recording.track)
+    assert quality.way_m == pytest.approx(float(np.linalg.norm(T[-1, :3, 3] - T[0, :3, 3])), abs=0.2)
 
 
 def test_gaps_and_scans_without_a_pose_are_named(kitti_folder, tmp_path):

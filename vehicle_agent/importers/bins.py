@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, RawScan
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of, read_file
-from gnd.vehicle_agent.importers.pcd import scan_number
+from gnd.vehicle_agent.importers.pcd import PERIOD_NS, START_NS, scan_number
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
 from gnd.vehicle_agent.importers.stamps import stamps_of_names
 from gnd.vehicle_agent.importers.trajectories.clocks import ns_of_number
@@ -25,9 +25,6 @@ WIDTHS: Final = (4, 5)
 MOST_RINGS: Final = 128
 GOOD: Final = 0.99
 LOOKED_AT: Final = 5
-PERIOD_NS: Final = 100_000_000
-START_NS: Final = 1_000_000_000_000_000_000
-"""Where neither names nor a file tell times."""
 KITTI_NAMES: Final = ("KITTI", "kitti")
 
 

@@ -6,7 +6,6 @@ keeps everything that it holds.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -16,9 +15,8 @@ from mcap.summary import Summary
 
 from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import GnssFix, MotionSample
-from gnd.schemas.drive_mcap import POINTS_TOPIC, load_track, read_header
+from gnd.schemas.drive_mcap import POINTS_TOPIC, is_drive, load_track, read_header
 from gnd.schemas.drive_messages import ns_of
-from gnd.schemas.drive_metadata import METADATA
 from gnd.schemas.errors import DriveError
 from gnd.schemas.mcap_file import open_mcap
 from gnd.vehicle_agent.errors import ImportDriveError
@@ -26,6 +24,7 @@ from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.fields import Field, TimeRule, scan_of_fields, unpack
 from gnd.vehicle_agent.importers.files import files_below
 from gnd.vehicle_agent.importers.recording import NOMINAL, Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.stamps import in_time_order
 
 FOXGLOVE_CLOUD: Final = "foxglove.PointCloud"
 _OWN_TIMES: Final = TimeRule("t_offset")
@@ -57,10 +56,10 @@ def open_mcap_clouds(place: Path, anchor: RecordingAnchor | None, topic: str | N
     paths = _paths(place)
     if not paths:
         raise ImportDriveError(f"{place}: no .mcap file there")
-    if len(paths) == 1 and _is_own_drive(paths[0]):
+    if len(paths) == 1 and is_drive(paths[0]):
         return _own_drive(paths[0])
     chosen, schema = _topic(paths, topic)
-    clouds, notes = _in_time_order([at for path in paths for at in _index(path, chosen)])
+    clouds, notes = in_time_order([at for path in paths for at in _index(path, chosen)])
     return Recording(
         name=place.stem,
         sensor_model="unknown",
@@ -84,22 +83,17 @@ def is_foxglove_or_own(place: Path) -> bool:
     for path in _paths(place):
         try:
             with open_mcap(path) as (_, summary):
-                if _cloud_topics(summary) or _is_own_drive(path):
+                if _cloud_topics(summary) or is_drive(path):
                     return True
         except DriveError:
             continue
     return False
 
 
-def _is_own_drive(path: Path) -> bool:
-    with open_mcap(path) as (reader, _):
-        return any(record.name == METADATA for record in reader.iter_metadata())
-
-
 def _own_drive(path: Path) -> Recording:
     """A drive of ours: poses where it has them for all scans, odometry and fixes as they are."""
     header, track = read_header(path), load_track(path)
-    clouds, notes = _in_time_order(_index(path, POINTS_TOPIC))
+    clouds, notes = in_time_order(_index(path, POINTS_TOPIC))
     frame = header.anchor
     t_ns, reference = np.array([at.stamp_ns for at in clouds], np.int64), track.reference
     covered = len(reference.t_ns) > 1 and reference.t_ns[0] <= t_ns[0] and t_ns[-1] <= reference.t_ns[-1]
@@ -158,17 +152,6 @@ def _index(path: Path, topic: str) -> list[_At]:
             stamp = ns_of(PointCloud.FromString(message.data).timestamp)
             found.append(_At(path, message.log_time, nth, stamp or message.log_time))
     return found
-
-
-def _in_time_order(clouds: list[_At]) -> tuple[list[_At], tuple[str, ...]]:
-    """Clouds by their stamps, each stamp once; and what had to be done for that."""
-    notes, kept = [], sorted(clouds, key=lambda at: at.stamp_ns)
-    if (late := sum(a.stamp_ns > b.stamp_ns for a, b in pairwise(clouds))) > 0:
-        notes.append(f"{late} clouds were not in the order of their stamps: sorted")
-    once = [at for i, at in enumerate(kept) if i == 0 or at.stamp_ns != kept[i - 1].stamp_ns]
-    if len(once) < len(kept):
-        notes.append(f"{len(kept) - len(once)} clouds have the stamp of another: left out")
-    return once, tuple(notes)
 
 
 def _read(at: _At, topic: str, rule: TimeRule | None = None) -> RawScan:

@@ -4,9 +4,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from gnd.schemas.drive_metadata import METADATA
+from gnd.schemas.drive_mcap import is_drive
 from gnd.schemas.errors import DriveError
-from gnd.schemas.mcap_file import open_mcap
 from gnd.vehicle_agent.errors import ImportDriveError
 
 
@@ -41,7 +40,6 @@ def _files(inputs: tuple[Path, ...]) -> Iterator[Path]:
 
 def _is_drive(path: Path) -> bool:
     try:
-        with open_mcap(path) as (reader, _):
-            return any(record.name == METADATA for record in reader.iter_metadata())
+        return is_drive(path)
     except DriveError:
         return False

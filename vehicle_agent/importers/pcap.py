@@ -43,16 +43,15 @@ def open_pcap(path: Path, anchor: RecordingAnchor | None, choices: Choices | Non
         ImportDriveError: no packets of a Velodyne, or a damaged file.
         MissingExtra: velodyne-decoder is not installed.
     """
-    del choices
     sizes = _sizes(path)
     if VELODYNE_BYTES not in sizes:
         held = ", ".join(f"{n} of {size} bytes" for size, n in sorted(sizes.items(), key=lambda one: -one[1])[:4])
         raise ImportDriveError(
             f"{path}: no packets of a Velodyne ({VELODYNE_BYTES} bytes) but {held or 'none'}. {_ADVICE}"
         )
-    store = _Turns(path)
+    store = _Turns(path, strict=choices is not None and choices.strict)
     t_ns = np.array([begin for begin, _, _ in store.index], np.int64)
-    left_out = (f"{store.left_out} turns cut off by the capture: left out",) if store.left_out else ()
+    cut_off = (f"{store.left_out} turns cut off by the capture: left out",) if store.left_out else ()
     others = tuple(
         Entry(f"{size} bytes", "UDP packets", n, "", "", "positions without a height" if size == 512 else "")
         for size, n in sizes.items() if size != VELODYNE_BYTES
@@ -67,7 +66,7 @@ def open_pcap(path: Path, anchor: RecordingAnchor | None, choices: Choices | Non
         anchor=anchor or NOMINAL,
         mount="assumed",
         placed=anchor is not None,
-        notes=left_out,
+        notes=(*store.notes, *cut_off),
         entries=(
             Entry(f"{VELODYNE_BYTES} bytes", "data packets", sizes[VELODYNE_BYTES], store.model, "scans"),
             *others,
@@ -89,27 +88,32 @@ def _sizes(path: Path) -> dict[int, int]:
 
 
 class _Turns:
-    """Turns of the sensor, decoded once into a file of their own: a capture can only be read from its beginning."""
+    """Turns of the sensor, decoded once into a file of their own: a capture can only be read from its beginning.
 
-    def __init__(self, path: Path) -> None:
+    A damaged capture gives the turns before the damage, with a note; none where `strict`.
+    """
+
+    def __init__(self, path: Path, *, strict: bool) -> None:
         self.index: list[tuple[int, int, int]] = []
-        self.model, self.left_out = "unknown", 0
+        self.model, self.left_out, self.notes = "unknown", 0, tuple[str, ...]()
         self._file: IO[bytes] = TemporaryFile()  # noqa: SIM115  (closed when the recording is no longer used)
         weakref.finalize(self, self._file.close)
-        self._decode(path)
+        self._decode(path, strict)
         usual = float(np.median([n for _, _, n in self.index])) if self.index else 0.0
         whole = [one for one in self.index if one[2] >= FULL * usual]
         self.left_out, self.index = len(self.index) - len(whole), whole
 
-    def _decode(self, path: Path) -> None:
+    def _decode(self, path: Path, strict: bool) -> None:
         decoder = library("velodyne_decoder", EXTRA)
         config = decoder.Config()
         try:
             for stamp, points in decoder.read_pcap(str(path), config, as_pcl_structs=True):
                 self._add(stamp.device if stamp.device > 1e8 else stamp.host, points)
         except Exception as error:
-            if not self.index:
-                raise ImportDriveError(f"{path}: {' '.join(str(error).split())[:200]}") from error
+            reason = " ".join(str(error).split())[:200]
+            if strict or not self.index:
+                raise ImportDriveError(f"{path}: {reason}") from error
+            self.notes = (f"damaged after {len(self.index)} turns, the rest is left out: {reason}",)
         self.model = str(config.model).rpartition(".")[2] if config.model is not None else "Velodyne"
 
     def _add(self, stamp_s: float, points: NDArray[Any]) -> None:

@@ -55,7 +55,7 @@ def open_pcd(folder: Path, anchor: RecordingAnchor | None, choices: Choices | No
         track=track,
         mount="assumed",
         placed=anchor is not None,
-        timed=track is not None or int(t_ns[0]) != START_NS,
+        timed=int(t_ns[0]) != START_NS,
         entries=(Entry(files[0].parent.name, "PCD files", len(files), f"{', '.join(fields)}; {rule.said}", "scans"),),
     )
 

@@ -64,7 +64,7 @@ class ImportQuality:
 
 def quality_of(recording: Recording, track: Trajectory) -> ImportQuality:
     """Of a recording whose track is known."""
-    p = track.T_dst_vehicle[:, :3, 3]
+    p = track.at(np.clip(recording.t_ns, track.t_ns[0], track.t_ns[-1]))[:, :3, 3]
     gnss = residuals_m(recording, track)
     ground = ground_seen(recording)
     return ImportQuality(

@@ -1,9 +1,10 @@
-"""File names that are stamps: seconds, milli-, micro- or nanoseconds since 1970."""
+"""Stamps of scans: in file names (seconds, milli-, micro- or nanoseconds since 1970), and in order."""
 
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,28 @@ from numpy.typing import NDArray
 from gnd.vehicle_agent.importers.trajectories.clocks import ns_of_number
 
 _STAMP: Final = re.compile(r"(\d{9,10}[._]\d{3,9}|\d{13}|\d{16}|\d{18,19})(?=\.|_|$)")
+
+
+class Stamped(Protocol):
+    """Where a cloud lies, and when it was stamped."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """UTC."""
+
+
+At = TypeVar("At", bound=Stamped)
+
+
+def in_time_order(clouds: list[At]) -> tuple[list[At], tuple[str, ...]]:
+    """Clouds by their stamps, each stamp once; and what had to be done for that."""
+    notes, kept = [], sorted(clouds, key=lambda at: at.stamp_ns)
+    if (late := sum(a.stamp_ns > b.stamp_ns for a, b in pairwise(clouds))) > 0:
+        notes.append(f"{late} clouds were not in the order of their stamps: sorted")
+    once = [at for i, at in enumerate(kept) if i == 0 or at.stamp_ns != kept[i - 1].stamp_ns]
+    if len(once) < len(kept):
+        notes.append(f"{len(kept) - len(once)} clouds have the stamp of another: left out")
+    return once, tuple(notes)
 
 
 def stamps_of_names(files: Sequence[Path]) -> NDArray[np.int64] | None:

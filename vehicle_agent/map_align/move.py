@@ -18,6 +18,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import GnssFix, ReferencePose
 from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
 from gnd.tile_store.values import DEFAULT_CODEC, lattice_named
+from gnd.vehicle_agent.importers.rigid import orthonormal
 from gnd.vehicle_agent.map_align.sources import AlignError, Side
 
 _POINTS: Final = 600
@@ -48,19 +49,12 @@ def moved_drive(source: Path, target: Path, frame: LocalFrame, T_a_b: F64, why: 
         for item in read_drive(source):
             match item:
                 case ReferencePose():
-                    writer.reference(ReferencePose(item.t_ns, _rigid(T_map @ item.T_map_vehicle)))
+                    moved, _ = orthonormal((T_map @ item.T_map_vehicle)[None, :3], str(source))
+                    writer.reference(ReferencePose(item.t_ns, moved[0]))
                 case GnssFix():
                     writer.gnss(_moved_fix(item, frame, T_a_b))
                 case _:
                     writer.add(item)
-
-
-def _rigid(T: F64) -> F64:
-    """T with its rotation made orthogonal again."""
-    U, _, V = np.linalg.svd(T[:3, :3])
-    found = T.copy()
-    found[:3, :3] = U @ V
-    return found
 
 
 def _moved_fix(fix: GnssFix, frame: LocalFrame, T: F64) -> GnssFix:

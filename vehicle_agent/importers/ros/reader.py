@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -33,6 +32,7 @@ from gnd.vehicle_agent.importers.ros.small_messages import (
     poses_of_topic,
     read_small,
 )
+from gnd.vehicle_agent.importers.stamps import in_time_order
 
 F64 = NDArray[np.float64]
 
@@ -74,7 +74,8 @@ def open_ros(place: Path, anchor: RecordingAnchor | None, choices: Choices | Non
     choices = choices or Choices()
     bag = Bag(place, strict=choices.strict)
     topic = cloud_topic(bag, choices.topic)
-    clouds, notes = _in_time_order(_index(bag, topic))
+    indexed = _index(bag, topic)
+    clouds, notes = in_time_order(indexed)
     frame, small = _one_frame(place, topic, clouds), read_small(bag)
     base = small.transforms.base(_odometry_frames(bag, small))
     mount = None if base is None else small.transforms.between(base, frame)
@@ -91,7 +92,7 @@ def open_ros(place: Path, anchor: RecordingAnchor | None, choices: Choices | Non
         anchor=anchor or _place(found.fixes) or NOMINAL,
         gnss=found.fixes,
         motion=found.motion,
-        notes=(*bag.notes, *notes, *clock_note, *found.notes),
+        notes=(*bag.notes, *notes, *_clock_note(indexed), *clock_note, *found.notes),
         mount="assumed" if mount is None else "given",
         placed=anchor is not None or bool(found.fixes),
         lever_m=found.lever_m,
@@ -132,18 +133,12 @@ def _index(bag: Bag, topic: str) -> list[_CloudAt]:
     return found
 
 
-def _in_time_order(clouds: list[_CloudAt]) -> tuple[list[_CloudAt], tuple[str, ...]]:
-    """Clouds by their stamps, each stamp once; and what had to be done for that."""
-    notes, kept = [], sorted(clouds, key=lambda at: at.stamp_ns)
-    if (late := sum(a.stamp_ns > b.stamp_ns for a, b in pairwise(clouds))) > 0:
-        notes.append(f"{late} clouds were not in the order of their stamps: sorted")
-    once = [at for i, at in enumerate(kept) if i == 0 or at.stamp_ns != kept[i - 1].stamp_ns]
-    if len(once) < len(kept):
-        notes.append(f"{len(kept) - len(once)} clouds have the stamp of another: left out")
+def _clock_note(clouds: list[_CloudAt]) -> tuple[str, ...]:
+    """A warning where the stamps and the times of recording are of two clocks."""
     late_ns = int(np.median([at.log_ns - at.stamp_ns for at in clouds])) if clouds else 0
-    if abs(late_ns) > CLOCKS_NS:
-        notes.append(f"the clouds' stamps are {late_ns * 1e-9:+.3f} s from when they were recorded: two clocks")
-    return once, tuple(notes)
+    if abs(late_ns) <= CLOCKS_NS:
+        return ()
+    return (f"the clouds' stamps are {late_ns * 1e-9:+.3f} s from when they were recorded: two clocks",)
 
 
 def _one_frame(place: Path, topic: str, clouds: list[_CloudAt]) -> str:
@@ -202,7 +197,7 @@ class _Measured:
 def _measured(bag: Bag, small: Small, base: str | None) -> _Measured:
     used, why, notes = dict[str, str](), dict[str, str](), list[str]()
     fixes, lever = _fixes(bag, small, base, used, why, notes)
-    motion = _motion(bag, small, base, used, why)
+    motion = _motion(bag, small, base, used, why, notes)
     return _Measured(fixes, motion, lever, used, why, tuple(notes))
 
 
@@ -230,7 +225,7 @@ def _fixes(
 
 
 def _motion(
-    bag: Bag, small: Small, base: str | None, used: dict[str, str], why: dict[str, str]
+    bag: Bag, small: Small, base: str | None, used: dict[str, str], why: dict[str, str], notes: list[str]
 ) -> tuple[MotionSample, ...]:
     imus = _held(bag, small, (IMU,))
     imu = small.by_topic[imus[0].name] if imus else []
@@ -246,6 +241,8 @@ def _motion(
         used[topic.name] = "speed" if said else "speed and yaw rate"
         if said:
             used[imus[0].name] = "yaw rate"
+        if (lost := len({t_ns for t_ns, _ in small.by_topic[topic.name]}) - len(samples)) > 0:
+            notes.append(f"{topic.name}: {lost} speeds without a number or without a turn rate near them: left out")
         return samples
     why.update({one.name: "gives no speed" for one in imus})
     return ()

@@ -31,7 +31,7 @@ SPEEDS: Final = (ODOMETRY, TWIST, TWIST_COVARIANCE)
 STAMPED_NS: Final = 100_000_000 * 1_000_000_000
 """A stamp before 1973 is a clock that nobody set: the log time is taken."""
 NEAR_NS: Final = 200_000_000
-"""An IMU's turn rate this near to a speed belongs to it."""
+"""An IMU's turn rate this near to a speed belongs to it; a speed without one is left out."""
 
 
 @dataclass(slots=True)
@@ -92,7 +92,8 @@ def motion_of_topic(
     """Speed and yaw rate of a topic that gives speed; the yaw rate of an IMU where the topic gives none.
 
     Returns:
-        The samples, none where the topic's twists are all zero although poses move, and the sentence that says so.
+        The samples, none where the topic's twists are all zero although poses move or no turn rate is near them, and
+        the sentence that says so.
     """
     twist: Callable[[Any], Any] = (lambda one: one.twist) if kind == TWIST else (lambda one: one.twist.twist)
     twists = {t: (float(twist(one).linear.x), float(twist(one).angular.z)) for t, one in messages}
@@ -100,18 +101,26 @@ def motion_of_topic(
     speed, rate = np.array([twists[t] for t in t_ns]).reshape(-1, 2).T
     if kind == ODOMETRY and not speed.any() and _moves(messages):
         return (), "its twist is zero although its poses move"
-    said = ""
+    said, near = "", np.ones(len(t_ns), bool)
     if not rate.any() and imu and R_base_imu is not None:
         imu_ns = np.array([t for t, _ in imu], np.int64)
         gyro = np.array([[one.angular_velocity.x, one.angular_velocity.y, one.angular_velocity.z] for _, one in imu])
         order = np.argsort(imu_ns, kind="stable")
         rate = np.interp(t_ns, imu_ns[order], (gyro @ R_base_imu.T)[order, 2])
+        near = _is_near(np.array(t_ns, np.int64), imu_ns[order])
         said = "yaw rate of the IMU"
-    good = np.isfinite(speed) & np.isfinite(rate)
+    good = np.isfinite(speed) & np.isfinite(rate) & near
     samples = tuple(
         MotionSample(t, float(v), float(w)) for t, v, w, ok in zip(t_ns, speed, rate, good, strict=True) if ok
     )
-    return samples, said
+    return samples, "no turn rate of the IMU near its times" if said and not near.any() else said
+
+
+def _is_near(t_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) whether one of the others, which grow, is within `NEAR_NS`."""
+    after = np.searchsorted(others_ns, t_ns)
+    before_ns, after_ns = others_ns[np.maximum(after - 1, 0)], others_ns[np.minimum(after, len(others_ns) - 1)]
+    return np.asarray(np.minimum(np.abs(t_ns - before_ns), np.abs(after_ns - t_ns)) <= NEAR_NS)
 
 
 def _moves(messages: list[tuple[int, Any]]) -> bool:
