@@ -99,9 +99,12 @@ def region_tiles(store: Store, layer: str, prefix: str) -> list[Tile]:
 def region_frame(tiles: list[Tile]) -> LocalFrame:
     """The ENU frame in the middle of the tiles' bounding box, on the ellipsoid."""
     corners = np.array([(*tile.tile_id.south_west_rad, *tile.tile_id.north_east_rad) for tile in tiles])
+    turn = 2.0 * np.pi
+    corners[:, 1::2] -= turn * np.round((corners[:, 1::2] - corners[0, 1]) / turn)  # a map across 180 degrees is one
     south, west = corners[:, :2].min(axis=0)
     north, east = corners[:, 2:].max(axis=0)
-    return LocalFrame(float(south + north) / 2, float(west + east) / 2, 0.0)
+    lon_rad = (west + east) / 2
+    return LocalFrame(float(south + north) / 2, float(lon_rad - turn * np.round(lon_rad / turn)), 0.0)
 
 
 def points_of(tile: Tile, frame: LocalFrame) -> Points:

@@ -53,7 +53,7 @@ class AutowareExport:
         points: how many points stand for them.
         written: cells whose content is new.
         kept: cells that were there with the same content.
-        removed: cells of the export before that are gone.
+        removed: cells of exports before that are gone.
         size_bytes: of all cells.
     """
 
@@ -96,20 +96,21 @@ def export_autoware(
     """
     tiles = region_tiles(store, layer, prefix)
     try:
-        before = _entries(folder)
+        _entries(folder)  # refuses a folder of another program
         projection = _projection(tiles, folder, projector)
         cells = {_name(corner, cloud): (corner, cloud) for corner, cloud in _cells(tiles, projection, points)}
         (folder / CLOUDS).mkdir(parents=True, exist_ok=True)
+        _write(folder / PROJECTOR, projection.yaml().encode())
         kept = {name for name in cells if (folder / CLOUDS / name).is_file()}
         for name in cells.keys() - kept:
             _write(folder / CLOUDS / name, _pcd(cells[name][1]))
         lines = [f"x_resolution: {CELL_M}.0", f"y_resolution: {CELL_M}.0"]
         lines += [f"{name}: [{corner[0]}, {corner[1]}]" for name, (corner, _) in sorted(cells.items())]
-        _write(folder / PROJECTOR, projection.yaml().encode())
         _write(folder / METADATA, "\n".join((*lines, "")).encode())
-        gone = before.keys() - cells.keys()
+        # those of an export that was interrupted, too
+        gone = {path.name for path in (folder / CLOUDS).iterdir() if _OURS.fullmatch(path.name)} - cells.keys()
         for name in gone:
-            (folder / CLOUDS / name).unlink(missing_ok=True)
+            (folder / CLOUDS / name).unlink()
         size_bytes = sum((folder / CLOUDS / name).stat().st_size for name in cells)
     except OSError as error:
         raise ExportError(f"{folder}: cannot write: {error.strerror or error}") from error
@@ -161,16 +162,17 @@ def _projection(tiles: list[Tile], folder: Path, projector: str | None) -> Proje
     """That of the export before, where there is one; else one whose origin is the middle of the tiles."""
     path = folder / PROJECTOR
     text = path.read_text() if path.is_file() else None
-    found = projection_in(text) if text is not None else None
-    if found is not None and projector in (None, found.projector):
-        return found
-    middle = region_frame(tiles)
-    lat_deg, lon_deg = float(np.degrees(middle.lat_rad)), float(np.degrees(middle.lon_rad))
-    fallback = "TransverseMercator" if text is None else "MGRS"
-    made = projection_for(projector or fallback, lat_deg, lon_deg, _ground_m(tiles))
+    made = projection_in(text) if text is not None else None
+    if made is None or projector not in (None, made.projector):
+        middle = region_frame(tiles)
+        lat_deg, lon_deg = float(np.degrees(middle.lat_rad)), float(np.degrees(middle.lon_rad))
+        fallback = "TransverseMercator" if text is None else "MGRS"
+        made = projection_for(projector or fallback, lat_deg, lon_deg, _ground_m(tiles))
     if text is not None and text != made.yaml():
+        name = f"{made.projector} {made.square}".strip()
         raise ProjectionError(
-            f"{path} says another projection than {made.projector} {made.square}: give an empty folder"
+            f"{path} says another projection than {name} with heights above the ellipsoid, or says it in other words: "
+            "give an empty folder"
         )
     return made
 

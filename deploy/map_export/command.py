@@ -15,6 +15,7 @@ from gnd.deploy.map_export.changes import ChangedVoxels, map_changes
 from gnd.deploy.map_export.foxglove import write_mcap
 from gnd.deploy.map_export.las import export_las
 from gnd.deploy.map_export.projection import PROJECTORS
+from gnd.deploy.map_export.sampling import PointsOf
 from gnd.deploy.map_export.scene import read_scene, store_of
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import tables
@@ -27,7 +28,9 @@ from gnd.tile_store.store import Store
 
 TO_HELP: Final = "What to write.  [default: by the file's ending]"
 PROJECTOR_HELP: Final = "Of --to autoware.  [default: that of the export before, else TransverseMercator]"
-POINTS_HELP: Final = "Of --to autoware: points 0.2 m apart that have the Gaussians' moments, or the means alone."
+POINTS_HELP: Final = (
+    "Of --to autoware: points 0.2 m apart that have the Gaussians' moments, or the means alone.  [default: samples]"
+)
 OUTPUTS: Final = (*FORMATS, "autoware", "las", "laz", "mcap")
 CHANGES_HELP: Final = "Write what differs as objects, for a GIS: FILE.gpkg or FILE.geojson (layers of Gaussians)."
 Written = tuple[dict[str, Any], str]
@@ -39,14 +42,19 @@ Written = tuple[dict[str, Any], str]
 @click.argument("out", metavar="FILE", type=PATH)
 @click.option("--to", "--format", "kind", type=click.Choice(OUTPUTS), help=TO_HELP)
 @click.option("--projector", type=click.Choice(PROJECTORS), help=PROJECTOR_HELP)
-@click.option(
-    "--points", type=click.Choice(("samples", "means")), default="samples", show_default=True, help=POINTS_HELP
-)
+@click.option("--points", type=click.Choice(("samples", "means")), help=POINTS_HELP)
 @region_option
 @layer_option
 @json_option
 def export(
-    path: Path, out: Path, kind: str | None, projector: str | None, points: Any, region: str, layer: str, as_json: bool
+    path: Path,
+    out: Path,
+    kind: str | None,
+    projector: str | None,
+    points: PointsOf | None,
+    region: str,
+    layer: str,
+    as_json: bool,
 ) -> None:
     """Write the newest tiles of STORE (or of the folder of a run) to FILE; of --to autoware FILE is the map's folder.
 
@@ -57,11 +65,12 @@ def export(
     name = kind or out.suffix.removeprefix(".").lower()
     if name not in OUTPUTS:
         raise ExportError(f"unknown export format {name!r}; known are {', '.join(OUTPUTS)}: say which with --to")
-    if projector is not None and name != "autoware":
-        raise ExportError(f"--projector is for --to autoware, not for {name}")
+    for option, said in (("--projector", projector), ("--points", points)):
+        if said is not None and name != "autoware":
+            raise ExportError(f"{option} is for --to autoware, not for {name}")
     with to_read(store_of(path)) as opened:
         if name == "autoware":
-            values, line = _autoware(opened, layer, region, out, projector, points)
+            values, line = _autoware(opened, layer, region, out, projector, points or "samples")
         elif name == "mcap":
             values, line = _mcap(opened, layer, region, out, path)
         else:
@@ -70,9 +79,10 @@ def export(
 
 
 def _plain(store: Store, layer: str, region: str, out: Path, name: str) -> Written:
-    result = (
-        export_las(store, layer, region, out) if name in ("las", "laz") else export_map(store, layer, region, out, name)
-    )
+    if name in ("las", "laz"):
+        result = export_las(store, layer, region, out, compressed=name == "laz")
+    else:
+        result = export_map(store, layer, region, out, name)
     line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
     return asdict(result) | {"path": str(result.path)}, line
 
@@ -94,7 +104,7 @@ def _mcap(store: Store, layer: str, region: str, out: Path, path: Path) -> Writt
     )
 
 
-def _autoware(store: Store, layer: str, region: str, out: Path, projector: str | None, points: Any) -> Written:
+def _autoware(store: Store, layer: str, region: str, out: Path, projector: str | None, points: PointsOf) -> Written:
     result = export_autoware(store, layer, region, out, projector=projector, points=points)
     grid = result.square or f"origin {result.lat_deg:.7f}, {result.lon_deg:.7f}, scale {result.scale:.9f}"
     line = (

@@ -29,8 +29,8 @@ COLUMNS: Final = {
 """Extra dimensions: type and description (of at most 31 bytes in the file)."""
 
 
-def export_las(store: Store, layer: str, prefix: str, path: Path) -> TilesExported:
-    """Write the newest tiles of a region as LAS, or LAZ where the name ends so.
+def export_las(store: Store, layer: str, prefix: str, path: Path, *, compressed: bool = False) -> TilesExported:
+    """Write the newest tiles of a region as LAS, or compressed as LAZ.
 
     Raises:
         ExportError: no tiles there, or the file cannot be written.
@@ -57,7 +57,7 @@ def export_las(store: Store, layer: str, prefix: str, path: Path) -> TilesExport
     covariance = _turned(points, frame, zone)
     for name in COLUMNS:
         las[name] = covariance[name] if name in covariance else points[name]
-    write_whole(path, lambda stream: las.write(stream, do_compress=path.suffix.lower() == ".laz"))
+    write_whole(path, lambda stream: las.write(stream, do_compress=compressed))
     return TilesExported(path, len(tiles), len(points), path.stat().st_size)
 
 

@@ -15,12 +15,11 @@ import numpy.typing as npt
 from gnd.deploy.errors import DeployError
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import WGS84_A_M
-from gnd.gnd_map.utm import SCALE, central_meridian_rad, geodetic_from_utm, utm_from_geodetic
+from gnd.gnd_map.utm import FALSE_EASTING_M, SCALE, central_meridian_rad, geodetic_from_utm, utm_from_geodetic
 
 PROJECTORS: Final = ("TransverseMercator", "MGRS", "LocalCartesianUTM")
 _ZONE: Final = 31  # its central meridian, 3 degrees east, stands for any other: longitudes are shifted to it
 _MERIDIAN_RAD: Final = central_meridian_rad(_ZONE)
-_FALSE_EASTING_M: Final = 500_000.0
 _SQUARE_M: Final = 100_000.0
 _FARTHEST_M: Final = 150_000.0
 _COLUMNS: Final = ("STUVWXYZ", "ABCDEFGH", "JKLMNPQR")  # of the zones 3n, 3n + 1, 3n + 2
@@ -78,7 +77,7 @@ class Projection:
         """Latitude and longitude, rad, of plane coordinates."""
         east = (np.asarray(x_m, np.float64) + self.east_m) / self.scale
         north = (np.asarray(y_m, np.float64) + self.north_m) / self.scale
-        lat, lon = geodetic_from_utm(SCALE * east + _FALSE_EASTING_M, SCALE * north, _ZONE)
+        lat, lon = geodetic_from_utm(SCALE * east + FALSE_EASTING_M, SCALE * north, _ZONE)
         return lat, _wrapped(lon - _MERIDIAN_RAD + self.meridian_rad)
 
     def yaml(self) -> str:
@@ -113,8 +112,8 @@ def projection_for(projector: str, lat_deg: float, lon_deg: float, height_m: flo
         return Projection(projector, meridian, SCALE, east, north, lat_deg, lon_deg)
     if projector != "MGRS":
         raise ProjectionError(f"unknown projector {projector!r}; known are {', '.join(PROJECTORS)}")
-    column, row = (int(np.floor(v / _SQUARE_M)) for v in (east + _FALSE_EASTING_M, north))
-    x0, y0 = column * _SQUARE_M - _FALSE_EASTING_M, row * _SQUARE_M
+    column, row = (int(np.floor(v / _SQUARE_M)) for v in (east + FALSE_EASTING_M, north))
+    x0, y0 = column * _SQUARE_M - FALSE_EASTING_M, row * _SQUARE_M
     band = _BANDS[min(max(int((lat_deg + 80.0) // 8.0), 0), len(_BANDS) - 1)]
     letters = _COLUMNS[zone % 3][column - 1] + _ROWS[(row + (0 if zone % 2 else 5)) % len(_ROWS)]
     return Projection(projector, meridian, SCALE, x0, y0, lat_deg, lon_deg, f"{zone}{band}{letters}")
@@ -162,7 +161,7 @@ def _mercator(lat_rad: F64, lon_rad: F64, meridian_rad: float) -> tuple[F64, F64
     """Easting and northing of scale 1 from a central meridian and the equator."""
     lon = _wrapped(lon_rad - meridian_rad)
     east, north = utm_from_geodetic(lat_rad, lon + _MERIDIAN_RAD, _ZONE)
-    return (east - _FALSE_EASTING_M) / SCALE, north / SCALE
+    return (east - FALSE_EASTING_M) / SCALE, north / SCALE
 
 
 def _wrapped(angle_rad: F64) -> F64:

@@ -83,6 +83,15 @@ def test_attributes_that_have_changed_are_written() -> None:
     assert data == STREET.replace(b'subtype="50"', b'subtype="30"')
 
 
+def test_an_attribute_that_has_gone_is_counted() -> None:
+    was = read(STREET)
+    sign = was["1", "signal", "a"]
+    other = replace(sign, attributes=tuple(one for one in sign.attributes if one[0] != "subtype"))
+    data, counts = rewritten([*(one for one in was.values() if one is not sign), other])
+    assert counts == {"unwritten": 1}
+    assert data == STREET
+
+
 def test_what_the_format_cannot_say_is_counted() -> None:
     """A copy of a row of lamps that has gone, and a border that has moved: the road network is not the features'."""
     was = read(STREET)

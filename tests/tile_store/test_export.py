@@ -13,6 +13,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.compare import map_diff, map_info, version_diff
 from gnd.tile_store.errors import StoreError, UnknownVersion
 from gnd.tile_store.export import ExportError, export_map, points_of, region_frame, region_tiles
@@ -92,6 +93,15 @@ def test_points_lie_where_geodesy_says(store: Store) -> None:
         lat, lon, height = VoxelGrid.of(tile.tile_id).centre_geodetic(tile.gaussians.voxel_id)
         expected = np.stack(to_enu.transform(np.degrees(lon), np.degrees(lat), height), axis=1)
         np.testing.assert_allclose(np.stack([points[n] for n in "xyz"], axis=1), expected, atol=1e-5)
+
+
+def test_a_map_across_180_degrees_has_its_frame_in_its_middle() -> None:
+    places = [TileId.from_geodetic(np.radians(-16.8), np.radians(lon_deg)) for lon_deg in (179.999, -179.999)]
+    for order in (places, places[::-1]):
+        tiles = [tile_of_voxels(place, 0) for place in order]
+        frame = region_frame(tiles)
+        assert abs(abs(np.degrees(frame.lon_rad)) - 180.0) < 0.01
+        assert np.abs(np.concatenate([points_of(tile, frame)["x"] for tile in tiles])).max() < 1000.0
 
 
 def test_means_and_covariances_turn_with_the_frame() -> None:

@@ -78,7 +78,9 @@ class _XodrEditing:
                 self._counts["removed"] += 1
                 self._edits.replace(element.start, element.end, b"")
             return
-        tags = {key: value for key, value in now.attributes if dict(was.attributes).get(key) != value}
+        before, after = dict(was.attributes), dict(now.attributes)
+        tags = {key: value for key, value in after.items() if before.get(key) != value}
+        self._counts["unwritten"] += not before.keys() <= after.keys()
         moved = self._step_m(was, now)
         if element is None or moved is None or (element.name == "signal" and len(was) > 1 and moved.any()):
             self._counts["unwritten"] += bool(tags) or moved is None or bool(moved.any())

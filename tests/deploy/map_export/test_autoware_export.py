@@ -10,7 +10,8 @@ import yaml
 from export_testing import Ndt, OnTiles, PlaneFrame, apart, beside, read_cell, read_export, scans_of, vgicp
 from map_export_maps import TILE, some_tile
 
-from gnd.deploy.map_export.autoware import CLOUDS, METADATA, PROJECTOR, export_autoware
+from gnd.deploy.map_export import autoware
+from gnd.deploy.map_export.autoware import CLOUDS, METADATA, PROJECTOR, export_autoware, read_metadata
 from gnd.deploy.map_export.projection import ProjectionError, projection_for, projection_in
 from gnd.deploy.map_export.sampling import sample
 from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
@@ -158,6 +159,39 @@ def test_a_name_changes_with_the_content_and_only_then(store: SqliteStore, tmp_p
     assert {name: t for name, t in after.items() if name in before}.items() <= before.items()
     names = yaml.safe_load((out / METADATA).read_text())
     assert set(after) == {name for name in names if name.endswith(".pcd")}
+
+
+def test_an_interrupted_export_leaves_nothing_behind(
+    store: SqliteStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Autoware loads all files of the folder: cells that no metadata names would lie in its map for ever."""
+    out, plain = tmp_path / "autoware", autoware._write
+
+    def full(path: Path, data: bytes) -> None:
+        if path.name == METADATA:
+            raise OSError(28, "No space left on device")
+        plain(path, data)
+
+    monkeypatch.setattr(autoware, "_write", full)
+    with pytest.raises(ExportError, match="No space left"):
+        export_autoware(store, "ndt", "", out, points="means")
+    left = len(list((out / CLOUDS).iterdir()))
+    assert left > 0
+    monkeypatch.setattr(autoware, "_write", plain)
+    assert export_autoware(store, "ndt", "", out).removed == left
+    assert {path.name for path in (out / CLOUDS).iterdir()} == set(read_metadata(out))
+
+
+@pytest.mark.parametrize("change", [("WGS84", "EGM2008"), ("altitude: 0.0", "altitude: 30.0")])
+def test_the_projection_of_another_map_is_not_written_over(
+    store: SqliteStore, tmp_path: Path, change: tuple[str, str]
+) -> None:
+    """A map beside a Lanelet2 map with heights above the geoid would lie tens of metres off it."""
+    text = projection_for("LocalCartesianUTM", 49.01, 8.43, 0.0).yaml().replace(*change)
+    (tmp_path / PROJECTOR).write_text(text)
+    with pytest.raises(ProjectionError, match="says another projection than LocalCartesianUTM with heights above"):
+        export_autoware(store, "ndt", "", tmp_path)
+    assert (tmp_path / PROJECTOR).read_text() == text
 
 
 def test_it_refuses_what_it_cannot_do_right(store: SqliteStore, tmp_path: Path) -> None:

@@ -75,6 +75,19 @@ def test_a_las_file_lies_where_its_crs_says(store: SqliteStore, tmp_path: Path, 
     assert set(COLUMNS) <= set(las.point_format.dimension_names)
 
 
+@pytest.mark.parametrize("kind", ["las", "laz"])
+def test_what_is_said_counts_and_not_the_ending(store: SqliteStore, tmp_path: Path, kind: str) -> None:
+    export(store, tmp_path / "map.dat", "--to", kind)
+    with laspy.open(tmp_path / "map.dat") as reader:
+        assert reader.header.are_points_compressed == (kind == "laz")
+
+
+@pytest.mark.parametrize("words", [("--points", "means"), ("--projector", "MGRS")])
+def test_an_option_of_another_format_is_refused(store: SqliteStore, tmp_path: Path, words: tuple[str, str]) -> None:
+    ran = CliRunner().invoke(gnd, ["map", "export", str(store.path), str(tmp_path / "map.ply"), *words])
+    assert f"{words[0]} is for --to autoware, not for ply" in str(ran.exception)
+
+
 def test_covariances_lie_along_the_axes_of_the_grid(store: SqliteStore, tmp_path: Path) -> None:
     """Twice the deviation along the first axis, projected as points are, is that of the covariance in the file."""
     export_las(store, "ndt", "", tmp_path / "map.las")
