@@ -10,7 +10,7 @@ from gnd.cloud_merger.errors import BadReport
 from gnd.cloud_merger.features.check import check_feature_report
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.features.spread import spread
-from gnd.gnd_map.features import Feature, is_feature_layer
+from gnd.gnd_map.features import Feature
 from gnd.gnd_map.tile_id import LAT_TILES, LON_TILES, District, TileId
 from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureReport
@@ -132,17 +132,6 @@ class FeatureInbox:
         raise BadReport(
             f"tile {tile} is not on the map, nor is any of any layer within {self._reach_tiles} tiles of it"
         )
-
-
-def check_is_of_gaussians(key: str, what: object) -> None:
-    """Refuse Gaussians on the key of a feature layer.
-
-    Raises:
-        BadReport: names the layer.
-    """
-    layer, _ = parse_change_key(key)
-    if is_feature_layer(layer):
-        raise BadReport(f"{type(what).__name__} speaks of Gaussians, layer {layer} holds features")
 
 
 def square(tile: TileId, reach: int) -> list[TileId]:

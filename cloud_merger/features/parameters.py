@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.gnd_map.settings import check_settings, setting
@@ -68,4 +68,4 @@ class FeatureMergeParameters:
 @lru_cache
 def gate_of(dimensions: int) -> float:
     """The largest squared Mahalanobis distance of a measurement of 1, 2 or 3 dimensions that passes."""
-    return float(chi2.ppf(FEATURE_GATE, dimensions))
+    return float(2.0 * gammaincinv(dimensions / 2.0, FEATURE_GATE))  # as scipy.stats.chi2, which loads slowly

@@ -35,7 +35,6 @@ MOST_OVERRUN: Final = 4
 
 _TOP: Final = 0xFFFFFFFF
 _ONE: Final = 65536
-_LEAST: Final = 24
 
 # 65536 / (1 + exp(-d / 256)) at d = -2048, -1984 ... 2048.
 _KNOTS: Final = (

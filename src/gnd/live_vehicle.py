@@ -251,12 +251,14 @@ class FeatureTilesOfMap:
         self._known: set[TileId] = set()
 
     def follow(self, place: "Place") -> Iterator[tuple[str, FeatureTile]]:
-        """The tiles that were not given yet, with the names of their layers."""
+        """The tiles that were not given yet, with the names of their layers. Those that a lost link did not bring are
+        asked for again after some more way.
+        """
         new = sorted(set(self._ahead.of(place)) - self._known)
-        self._known.update(new)
         for layer in self._layers if new else ():
             for tile in self._fetch(layer, new):
                 yield layer, as_kind(tile, FeatureTile)
+        self._known.update(new)
 
 
 class _Passed:

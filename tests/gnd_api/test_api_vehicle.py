@@ -1,6 +1,6 @@
 """Recorded drives and a fed vehicle: poses against the drive's reference, reports up to a real merger."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,17 @@ import pytest
 from api_testing import EAST, HERE, SCANS, Cloud, Program, sign_tile
 
 import gnd
+from gnd.fleet_bus.errors import RequestFailed
+from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.tile_id import TileId
 from gnd.live_vehicle import FeatureTilesOfMap, Fetch, TilesOfMap
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
 from gnd.schemas.keys import batch_key
 from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.link.feature_tiles_on_the_bus import STEP_M
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
@@ -171,6 +175,25 @@ def test_the_tiles_of_a_district_are_one_question_and_features_come_too(
         assert [(layer, tile.tile_id) for layer, tile in features.follow(place)] == [("signs", HERE), ("signs", EAST)]
         assert len(asked) == len(set(asked))
         assert list(features.follow(place)) == [], "no way, no question"
+
+
+def test_features_that_a_lost_link_did_not_bring_are_asked_for_again() -> None:
+    lat_rad, lon_rad = HERE.centre_rad
+    place, asked = Place(gnd.LocalFrame.of_tile(HERE), GnssFix(0, lat_rad, lon_rad, 30.0, 1.0)), list[str]()
+
+    def once_without_answer(layer: str, tiles: Sequence[TileId]) -> Iterator[AnyTile]:
+        asked.append(layer)
+        if len(asked) == 1:
+            raise RequestFailed("gnd/v1/tiles", 1, "no answer")
+        return iter([sign_tile(HERE, 1)] if HERE in tiles else [])
+
+    features = FeatureTilesOfMap(once_without_answer, ["signs"])
+    with pytest.raises(RequestFailed):
+        list(features.follow(place))
+    place.odometer_m += STEP_M
+    assert [tile.tile_id for _, tile in features.follow(place)] == [HERE]
+    place.odometer_m += STEP_M
+    assert list(features.follow(place)) == [], "each tile once"
 
 
 @pytest.mark.slow
