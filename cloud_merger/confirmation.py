@@ -63,6 +63,14 @@ class ConfirmationParameters:
         "less surely.",
         least=1,
     )
+    parked_h: float = setting(
+        24.0,
+        "What is new and has the shape of a vehicle must have stood for so long, whoever saw it; each time that "
+        "something has gone from there doubles it. 0: it is published as anything else.",
+        unit="h",
+        least=0,
+        most=336,
+    )
 
     def __post_init__(self) -> None:
         check_settings(self, MergerError)

@@ -30,6 +30,13 @@ from gnd.cloud_merger.parameters import (
     MERGE_XI_RESHAPED,
     MergeParameters,
 )
+from gnd.cloud_merger.parked import (
+    PARKED_FREE_SHARE,
+    PARKED_MOST_H,
+    PARKED_PLACE_GOINGS,
+    PARKED_SEEN_SHARE,
+    PARKED_THERE_SHARE,
+)
 from gnd.cloud_merger.shift import (
     SHIFT_BEYOND_CHANCE,
     SHIFT_DISPLACED_M,
@@ -64,6 +71,13 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
         "vouched_share": CONFIRMATION_VOUCHED_SHARE,
         "well_known_m": CONFIRMATION_WELL_KNOWN_M,
         "second_drive_s": CONFIRMATION_SECOND_DRIVE_S,
+    },
+    "parked": {
+        "most_h": PARKED_MOST_H,
+        "place_goings": PARKED_PLACE_GOINGS,
+        "seen_share": PARKED_SEEN_SHARE,
+        "there_share": PARKED_THERE_SHARE,
+        "free_share": PARKED_FREE_SHARE,
     },
     "shift": {
         "max_m": SHIFT_MAX_M,
@@ -117,6 +131,7 @@ def with_text(config: ShardConfig, text: str) -> ShardConfig:
         said = json.loads(text)
         if said["format"] != _FORMAT:
             raise MergerError(f"parameters of format {said['format']}, this release reads {_FORMAT}")
+        said["confirmation"].setdefault("parked_h", 0.0)  # made when nothing was held back for its shape
         _take_constants(said)
         groups = {name: from_mapping(kind, said[name], where=name) for name, kind in _GROUPS.items()}
         declared = tuple(from_mapping(LayerParameters, table) for table in said.get("feature_layer", ()))
@@ -135,6 +150,6 @@ def _take_constants(said: dict[str, Any]) -> None:
     """
     for group, constants in _CONSTANTS.items():
         for name, value in constants.items():
-            told = said[group].pop(name, value)
+            told = said.get(group, {}).pop(name, value)
             if told != value:
                 raise MergerError(f"{group}.{name} is {told!r}; it is {value!r} in this release, and nobody sets it")

@@ -6,6 +6,8 @@
 - *Claims*: what vehicles said against the present state and nobody has decided yet, of each voxel the newest, of each
   vehicle at most two. They vote in the windows that come, so vehicles that each saw too little decide together; each
   later confirmation of the present state takes the oldest one away.
+- *Parked things*: since when something with the shape of a vehicle stands in a voxel, and how often something has gone
+  from there (`gnd.cloud_merger.parked`).
 
 Nothing here grows with the number of reports.
 """
@@ -37,13 +39,19 @@ CLAIMS_OF_VEHICLE: Final = 2
 ANOTHER_DRIVE_S: Final = 1800.0
 """Votes of one vehicle within so long, by receipt, are one vote, in however many windows they fall."""
 MOST_OBSERVERS: Final = 255
-_FORMAT: Final = 1
+_FORMAT: Final = 2
+"""1: without parked things."""
 _LEVEL: Final = 3
 _NS_PER_S: Final = 1_000_000_000
 
 # One remembered voxel. `observers`: vehicles that confirmed its state, counted up to 255; `last`: 16 bits of the hash
 # of the one that did so last; `day`: of the last observation, `gnd.gnd_map.day`.
 VOXEL: Final = np.dtype([("voxel_id", np.int32), ("observers", np.uint8), ("last", np.uint16), ("day", np.uint16)])
+
+# One voxel in which something with the shape of a vehicle stands or stood. `since_ns`: since when it was seen there
+# without a break, UTC; 0: nothing stands. `goings`: how often something has gone from there, counted up to 255.
+PARKED: Final = np.dtype([("voxel_id", np.int32), ("since_ns", np.int64), ("goings", np.uint8)])
+ParkedVoxels = NDArray[Any]  # of dtype PARKED, sorted by voxel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,18 +64,21 @@ class TileMemory:
         witnesses: the reports that claim them, without what they say.
         voters: of each vehicle that voted within the last half hour of a closed window, when its newest report was
             received, int ns UTC.
+        parked: PARKED (P,) sorted by voxel id.
     """
 
     voxels: NDArray[Any] = field(default_factory=lambda: np.zeros(0, VOXEL))
     claims: Rows = field(default_factory=lambda: np.zeros(0, STATEMENT))
     witnesses: tuple[Witness, ...] = ()
     voters: Mapping[str, int] = field(default_factory=dict)
+    parked: ParkedVoxels = field(default_factory=lambda: np.zeros(0, PARKED))
 
     def __post_init__(self) -> None:
-        if self.voxels.dtype != VOXEL or self.claims.dtype != STATEMENT:
-            raise MergerError(f"a memory of {self.voxels.dtype} and {self.claims.dtype}")
-        if (np.diff(self.voxels["voxel_id"]) <= 0).any():
-            raise MergerError(f"a memory of {len(self.voxels)} voxels that are not strictly ascending")
+        if self.voxels.dtype != VOXEL or self.claims.dtype != STATEMENT or self.parked.dtype != PARKED:
+            raise MergerError(f"a memory of {self.voxels.dtype}, {self.claims.dtype} and {self.parked.dtype}")
+        for rows in (self.voxels, self.parked):
+            if (np.diff(rows["voxel_id"]) <= 0).any():
+                raise MergerError(f"a memory of {len(rows)} voxels that are not strictly ascending")
         if len(self.claims) and not 0 <= self.claims["report"].min() <= self.claims["report"].max() < len(
             self.witnesses
         ):
@@ -127,11 +138,12 @@ class TileMemory:
                 "claims": len(self.claims),
                 "witnesses": [_told(one) for one in self.witnesses],
                 "voters": dict(self.voters),
+                "parked": len(self.parked),
             }
         ).encode()
         columns = [np.ascontiguousarray(self.voxels[name]).tobytes() for name in ("observers", "last", "day")]
         ids = np.diff(self.voxels["voxel_id"], prepend=np.int32(0)).astype("<i4").tobytes()
-        parts = [len(head).to_bytes(4, "little"), head, ids, *columns, self.claims.tobytes()]
+        parts = [len(head).to_bytes(4, "little"), head, ids, *columns, self.claims.tobytes(), self.parked.tobytes()]
         return zstandard.ZstdCompressor(level=_LEVEL).compress(b"".join(parts))
 
     @classmethod
@@ -145,8 +157,8 @@ class TileMemory:
             data = zstandard.ZstdDecompressor().decompress(body)
             at = 4 + int.from_bytes(data[:4], "little")
             head = json.loads(data[4:at])
-            if head["format"] != _FORMAT:
-                raise MergerError(f"a memory of format {head['format']}, this release reads {_FORMAT}")
+            if head["format"] not in (1, _FORMAT):
+                raise MergerError(f"a memory of format {head['format']}, this release reads 1 to {_FORMAT}")
             n, rest = head["voxels"], memoryview(data)[at:]
             voxels = np.zeros(n, VOXEL)
             voxels["voxel_id"] = np.cumsum(np.frombuffer(rest[: 4 * n], "<i4"))
@@ -156,7 +168,8 @@ class TileMemory:
                 voxels[name] = np.frombuffer(rest[first : first + size], VOXEL[name])
                 first += size
             claims = np.frombuffer(rest[first:], STATEMENT, head["claims"]).copy()
-            return cls(voxels, claims, tuple(Witness(**one) for one in head["witnesses"]), head["voters"])
+            parked = np.frombuffer(rest[first + claims.nbytes :], PARKED, head.get("parked", 0)).copy()
+            return cls(voxels, claims, tuple(Witness(**one) for one in head["witnesses"]), head["voters"], parked)
         except (ValueError, KeyError, TypeError, zstandard.ZstdError) as error:
             raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
 

@@ -20,9 +20,11 @@ from gnd.cloud_merger.memory import (
     CLAIMS_OF_VOXEL,
     MOST_OBSERVERS,
     VOXEL,
+    ParkedVoxels,
     TileMemory,
 )
 from gnd.cloud_merger.merge import MergedTile, MergeParameters, merge_tile
+from gnd.cloud_merger.parked import hold_parked, parked_after
 from gnd.cloud_merger.snapping import Snapping
 from gnd.cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness, find, statements_of
 from gnd.gnd_map.codec import Lattice, snap
@@ -54,12 +56,16 @@ class MergedWindow:
         statements: of those that are believed, and of the memory.
         gated: the tile as it may be published, and what waits.
         gaussians: of that tile, on its lattice.
+        parked: what has the shape of a vehicle and is held back.
+        bases: Gaussians of the versions that the reports refer to, by content hash.
     """
 
     believed: Believed
     statements: Statements
     gated: GatedTile
     gaussians: Gaussians
+    parked: ParkedVoxels
+    bases: Mapping[bytes, Gaussians]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,16 +97,20 @@ class WindowMerger:
         if rules.mode == "paper":  # it knows neither shift tests nor a gate nor a memory
             in_play = Believed(tuple(reports), (), ())
             statements = statements_of(state.gaussians, reports, self.bases, "paper")
-            gated = GatedTile(merge_tile(state.gaussians, statements, rules))
+            gated, parked = GatedTile(merge_tile(state.gaussians, statements, rules)), state.memory.parked
         else:
             shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
             in_play = believed(reports, shifts, named)
             statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
             merged = merge_tile(state.gaussians, statements, rules)
             by, seen = statements.witnesses, in_play.reports
-            found = gate(state.gaussians, merged, seen, self.confirmation, named, witnesses=by)
-            gated = GatedTile(found.merged, (*found.waiting, *in_play.set_aside))
-        return MergedWindow(in_play, statements, gated, self._on_lattice(gated.merged, reports, lattice))
+            standing = state.memory.parked, self.bases, self.confirmation.parked_h
+            free = hold_parked(state.gaussians, merged, seen, *standing)
+            found = gate(state.gaussians, free.merged, seen, self.confirmation, named, witnesses=by)
+            gated = GatedTile(found.merged, (*found.waiting, *free.waiting, *in_play.set_aside))
+            parked = free.voxels
+        gaussians = self._on_lattice(gated.merged, reports, lattice)
+        return MergedWindow(in_play, statements, gated, gaussians, parked, self.bases)
 
     def _on_lattice(self, merged: MergedTile, reports: Sequence[Report], lattice: Lattice | None) -> Gaussians:
         if lattice is None:
@@ -131,7 +141,8 @@ def fold(state: TileState, window: MergedWindow) -> TileState:
     is_fresh = np.append(fresh[:n], False)[np.where((rows["report"] >= 0) & (rows["report"] < n), rows["report"], n)]
     claims, witnesses = _claims_left(window.statements, agrees, is_fresh & agrees, is_changed)
     voxels = _observed(state.memory, window, merged.changed, agrees)
-    return TileState(window.gaussians, TileMemory(voxels, claims, witnesses, _voters(state.memory, reports)))
+    parked = parked_after(state.memory.parked, window.parked, window.gaussians.voxel_id, reports, window.bases)
+    return TileState(window.gaussians, TileMemory(voxels, claims, witnesses, _voters(state.memory, reports), parked))
 
 
 def _claims_left(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.fleet_sim.camera import Sightings, SignCamera, look_times_ns, looks_of, sightings
-from gnd.fleet_sim.cars import parked_cars
+from gnd.fleet_sim.cars import cars_of_hour, parked_cars
 from gnd.fleet_sim.errors import DriveSimError
 from gnd.fleet_sim.lidar import Lidar, column_poses
 from gnd.fleet_sim.raycast import Scene
@@ -80,6 +80,8 @@ class DriveConfig:
         seed: everything random of this drive.
         cruise_mps: speed once under way.
         car_share: share of parking slots that are taken.
+        hours: since the first drive of all: cars stay, and drives of one hour meet mostly the same ones. None: this
+            drive has cars of its own.
         scans: at most so many scans, None for the whole street.
         gnss_hz: rate of the GNSS.
         errors: of the vehicle's sensors.
@@ -96,6 +98,7 @@ class DriveConfig:
     seed: int = 0
     cruise_mps: float = 9.0
     car_share: float = 0.2
+    hours: float | None = None
     scans: int | None = None
     gnss_hz: int = 10
     errors: SensorErrors = field(default_factory=SensorErrors)
@@ -172,7 +175,11 @@ class DriveSimulation:
         self.scans = whole if config.scans is None else min(whole, config.scans)
         if self.scans < 1:
             raise DriveSimError(f"a drive needs at least one scan, got {self.scans} ({duration_s:.2f} s of street)")
-        cars = parked_cars(world, config.state, config.car_share, config.seed)
+        cars = (
+            parked_cars(world, config.state, config.car_share, config.seed)
+            if config.hours is None
+            else cars_of_hour(world, config.state, config.car_share, config.hours)
+        )
         shapes = (*world.shapes(config.state), *cars)
         self._scene = Scene.build(shapes, world.A_street_map)
         stage = Stage(world, shapes, self._scene, self.motion, self._seconds, config.seed)

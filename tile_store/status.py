@@ -24,6 +24,7 @@ WORDS: Final[dict[WaitingReason, str]] = {
     "doubtful": "the vehicle doubts it itself",
     "shift": "a shift of its poses explains it",
     "named": "its reports are shifted again and again",
+    "parked": "the shape of a vehicle, and has not stood for long",
 }
 
 DOUBTED: Final = ("doubtful", "shift")

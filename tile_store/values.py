@@ -21,7 +21,7 @@ from gnd.tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
-WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named"]
+WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named", "parked"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -428,7 +428,8 @@ class Unconfirmed:
         seen: voxels of the tile that it observed and that hold something, before or by its word.
         reason: "share": too large a share; "isolated": little, but nothing beside it has come or gone; "poses": of
             reports with poor poses only; "doubtful": the vehicle doubts it itself; "shift": a shift of its poses
-            explains it; "named": its reports are shifted again and again.
+            explains it; "named": its reports are shifted again and again; "parked": it has the shape of a vehicle
+            and has not stood for long, whoever saw it.
     """
 
     vehicle: str

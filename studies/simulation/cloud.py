@@ -2,20 +2,27 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.cloud_merger.confirmation import ConfirmationParameters
 from gnd.cloud_merger.expanding import base_versions, expand, is_askable, with_measured
+from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.merge import MergeParameters, merge_tile
-from gnd.cloud_merger.statements import Report, statements_of
+from gnd.cloud_merger.parked import hold_parked
+from gnd.cloud_merger.statements import Mode, Report, statements_of
 from gnd.cloud_merger.votes import TileVotes
 from gnd.cloud_merger.wants import Known, WantParameters, wanted
+from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.codec import encode_mask
 from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile, TileDelta, apply
 from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.vehicle_shape import has_vehicle_shape
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.packed import PackedReport
 from gnd.vehicle_agent.report.packing import pack_measured
@@ -24,6 +31,8 @@ from studies.simulation.options import Upload
 from studies.simulation.result import VehicleResult
 
 Tiles = Mapping[TileId, Gaussians]
+NOTHING_PARKED: Final = TileMemory().parked
+PARKED_H: Final = ConfirmationParameters().parked_h
 
 
 def reports_of_tiles(bodies: Iterable[bytes], parameters: MergeParameters) -> dict[TileId, list[Report]]:
@@ -32,7 +41,8 @@ def reports_of_tiles(bodies: Iterable[bytes], parameters: MergeParameters) -> di
     for body in bodies:
         report = ChangeReport.decode(body)
         for change in report.tiles:
-            found[change.tile].append(parameters.report_of(report.report_id, report.sensor_model, change))
+            one = parameters.report_of(report.report_id, report.sensor_model, change)
+            found[change.tile].append(replace(one, first_ns=report.first_ns, last_ns=report.last_ns))
     return dict(found)
 
 
@@ -43,17 +53,31 @@ def merged_map(base: BaseMap, bodies: Sequence[bytes], parameters: MergeParamete
         epoch = base.tiles.get(tile, Gaussians.empty())
         bases = {base.shas[tile]: epoch} if tile in base.shas else {}
         merged = merge_tile(epoch, statements_of(epoch, reports, bases, parameters.mode), parameters)
+        if parameters.mode == "default":
+            merged = hold_parked(epoch, merged, reports, NOTHING_PARKED, bases, PARKED_H).merged
         final[tile] = merged.gaussians
     return final
 
 
-def map_of_one(base: BaseMap, bodies: Iterable[bytes]) -> dict[TileId, Gaussians]:
-    """Return the base map with what one vehicle reports, no cloud in between."""
+def map_of_one(base: BaseMap, bodies: Iterable[bytes], mode: Mode = "default") -> dict[TileId, Gaussians]:
+    """Return the base map with what one vehicle reports, no cloud in between.
+
+    What has the shape of a standing vehicle is no change, in default mode: whoever takes the report sees it as well.
+    """
     final = dict(base.tiles)
     for tile, reports in reports_of_tiles(bodies, MergeParameters()).items():
+        before = final.get(tile, Gaussians.empty())
         for report in reports:
             final[tile] = _with_change(final.get(tile, Gaussians.empty()), report.change)
+        if mode == "default":
+            final[tile] = _without_parked(tile, before, final[tile])
     return final
+
+
+def _without_parked(tile: TileId, before: Gaussians, after: Gaussians) -> Gaussians:
+    at = np.flatnonzero(~are_in(after.voxel_id, before.voxel_id))
+    parked = at[has_vehicle_shape(VoxelGrid.of(tile), before, after.take(at))]
+    return after.take(np.setdiff1d(np.arange(len(after)), parked))
 
 
 def _with_change(tile: Gaussians, change: TileChange) -> Gaussians:

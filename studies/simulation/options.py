@@ -165,6 +165,12 @@ class RunOptions:
     )
     sensors: tuple[str, ...] = sensors_option(tuple(SHORT_NAMES), "Sensors that the fleet cycles through.")
     parking: float = option(0.2, PARKING, span=(0, 1))
+    hours: float | None = option(
+        None,
+        "All vehicles drive within so many hours and meet the cars that stand then; without it an hour lies between "
+        "two drives, and each meets cars of its own.",
+        span=(0, 10_000),
+    )
     traffic: bool = option(True, "Moving cars and pedestrians.")
     mode: Mode = option("default", "Whose rules.")
     poses: PoseSource = option(
@@ -205,6 +211,7 @@ def fleet_configs(options: RunOptions, seed: int) -> tuple[DriveConfig, ...]:
     Directions alternate, and each sensor drives both ways.
     """
     sensors, round_trip = fleet_sensors(options, seed), len(options.sensors)
+    step_h = 1.0 if options.hours is None else options.hours / max(options.fleet_size - 1, 1)
     return tuple(
         DriveConfig(
             vehicle=f"vehicle-{index:02d}",
@@ -212,9 +219,10 @@ def fleet_configs(options: RunOptions, seed: int) -> tuple[DriveConfig, ...]:
             direction=1 if (index + index // round_trip * (round_trip % 2 == 0)) % 2 == 0 else -1,
             seed=1_000_003 * seed + index,
             car_share=options.parking,
+            hours=None if options.hours is None else round(index * step_h, 6),
             traffic=Traffic.urban() if options.traffic else Traffic(),
             scans=options.scans,
-            start_ns=EPOCH_NS + index * _HOUR_NS,
+            start_ns=EPOCH_NS + round(index * step_h * _HOUR_NS),
         )
         for index, sensor in enumerate(sensors)
     )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.merge import MergeParameters
+from gnd.cloud_merger.statements import Mode
 from gnd.fleet_sim.evaluate import CLASSES, Evaluation, Score, evaluate_maps
 from gnd.fleet_sim.truth import LEVELS, Level, read_truth
 from gnd.gnd_map.config import to_mapping
@@ -67,13 +68,13 @@ class VehicleFile:
         return read_result(self.path, self.key)
 
 
-def score_single(files: WorldFiles, vehicles: Sequence[VehicleFile]) -> dict[str, Scored]:
+def score_single(files: WorldFiles, vehicles: Sequence[VehicleFile], mode: Mode = "default") -> dict[str, Scored]:
     """Return the stale map's score and that of each vehicle alone, by name."""
     truth, base = read_truth(files.truth), read_world_base(files)
     found = {STALE: Scored.of(evaluate_maps(truth, base.tiles, base.tiles))}
     for vehicle in vehicles:
         result = vehicle.read()
-        found[result.vehicle] = Scored.of(evaluate_maps(truth, base.tiles, map_of_one(base, result.reports)))
+        found[result.vehicle] = Scored.of(evaluate_maps(truth, base.tiles, map_of_one(base, result.reports, mode)))
     return found
 
 

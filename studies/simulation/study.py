@@ -122,7 +122,7 @@ def _scores(
     shares = [share for k in range(bench.processes) if (share := list(many[k :: bench.processes]))]
     jobs, merge, upload = [], options.method.merge, options.upload
     for seed, of_world in vehicles.items():
-        jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world)))
+        jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world, merge.mode)))
         jobs += [
             Job(f"merges, world {seed}", score_fleet, (files[seed], of_world, share, merge, upload)) for share in shares
         ]

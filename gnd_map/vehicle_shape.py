@@ -1,0 +1,188 @@
+"""Which new Gaussians of a tile have the shape of a standing vehicle.
+
+A parked car is no change of the map, whoever saw it and however many did within the hour. Its shape says so before time
+does: it stands on the ground that the map knows, is between a low bonnet and the roof of a van high, wider than a wall
+and not longer than a row of cars of its height. Only Gaussians are used, so a vehicle and the cloud judge alike, and
+nothing is sent for it.
+"""
+
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+
+Mask = NDArray[np.bool_]
+Shape = Literal["none", "piece", "vehicle"]
+
+GROUND_REACH_M: Final = 2.5
+GROUND_BELOW_M: Final = 3.5
+FLAT_SIGMA_M: Final = 0.12
+"""A Gaussian no thicker than this from bottom to top is a piece of ground, where it lies below what stands."""
+EDGE_SIGMAS: Final = 1.7
+"""A surface that fills a voxel evenly ends at √3 of its standard deviations."""
+BESIDE: Final = 1.8
+"""Voxels side by side, also across an edge or a corner, are of one thing."""
+BOTTOM_M: Final = 1.2
+"""What begins higher over the ground than a car's belt line does not stand on wheels."""
+TOP_M: Final = (0.9, 2.3)
+"""Roofs, over the ground; of what is as long and wide as a van up to `VAN_TOP_M`."""
+SEVERAL: Final = 4
+LEAST_HEIGHT_M: Final = 0.35
+"""Several voxels that hold less than this from bottom to top are a plate."""
+VAN_TOP_M: Final = 2.9
+WIDTH_M: Final = (1.3, 4.0)
+LENGTH_M: Final = (2.5, 9.0)
+GAP_M: Final = 0.1
+"""Cars that stand in a row have gaps between them."""
+ROW_RUN_M: Final = 2.5
+"""In a row that is longer than one car the longest stretch without a gap is at least so long."""
+MOST_CONTACT: Final = 0.35
+"""What touches a higher thing with more of its voxels is a part of that."""
+PIECE_M: Final = (0.55, 0.8)
+"""Least width and length of a piece of a car of which little was seen."""
+BELOW_GROUND_M: Final = -0.3
+RAISED_M: Final = 0.05
+"""A piece of a car, of which little was seen, begins above the ground: below its sills the road is seen."""
+
+
+def has_vehicle_shape(grid: VoxelGrid, before: Gaussians, new: Gaussians) -> Mask:
+    """Which of some Gaussians are of a group that has the shape of a standing vehicle.
+
+    Args:
+        grid: the tile's.
+        before: (M,) Gaussians of the map, among which is the ground.
+        new: (N,) Gaussians of voxels that the map holds nothing in.
+
+    Returns:
+        (N,) mask. Where the map has no ground nobody knows how high a thing stands: False.
+    """
+    found = np.zeros(len(new), bool)
+    if not len(new):
+        return found
+    flat = _flat_places_m(grid, before)
+    place = _places_m(grid, new)
+    ground = _ground_m(place, flat)
+    spread = EDGE_SIGMAS * np.sqrt(np.maximum(new.cov_m2[:, 5].astype(np.float64), 0.0))
+    low, top = place[:, 2] - spread - ground, place[:, 2] + spread - ground
+    index = np.stack(grid.unravel(new.voxel_id), axis=1)
+    cov = new.cov_m2.astype(np.float64)
+    for mine in groups_of(index, np.arange(len(new))):
+        if _shape(low[mine], top[mine], place[mine, :2], cov[mine]) != "none":
+            found[mine] = True
+            continue
+        for part in groups_of(
+            index, mine[_is_low_column(index[mine], top[mine])]
+        ):  # a car beside something that is none
+            found[part] = _shape(low[part], top[part], place[part, :2], cov[part]) == "vehicle"
+    return found
+
+
+def _is_low_column(index: I64, top: F64) -> Mask:
+    """Which voxels lie in columns in which nothing reaches higher than the roof of a car."""
+    _, column = np.unique(index[:, :2], axis=0, return_inverse=True)
+    highest = np.full(int(column.max()) + 1, -np.inf)
+    np.fmax.at(highest, column, top)
+    return np.asarray(highest[column] <= TOP_M[1])
+
+
+def _contact(index: I64, others: I64) -> float:
+    """The share of a thing's voxels that lie beside others."""
+    if not len(others):
+        return 0.0
+    return float((KDTree(others).query(index)[0] < BESIDE).mean())
+
+
+def _shape(low: F64, top: F64, at: F64, cov: F64, *, in_row: bool = True) -> Shape:
+    """The shape of a group: its lower and upper ends over the ground (K,), places (K, 2), covariances (K, 6).
+
+    `in_row`: whether several vehicles in a row are one, too.
+    """
+    if np.isnan(low).mean() > 0.5:
+        return "none"
+    bottom, roof = float(np.nanmin(low)), float(np.nanmax(top))
+    if not BELOW_GROUND_M < bottom < BOTTOM_M or roof < TOP_M[0]:
+        return "none"
+    width, length, run = _footprint_m(at, cov)
+    if roof > TOP_M[1]:
+        is_van = roof <= VAN_TOP_M and 1.5 <= width <= 2.9 and 3.5 <= length <= 7.5
+        return "vehicle" if is_van else "none"
+    if len(at) >= SEVERAL and roof - bottom < LEAST_HEIGHT_M:
+        return "none"
+    is_one = LENGTH_M[0] <= length <= LENGTH_M[1]
+    is_row = in_row and length > LENGTH_M[1] and ROW_RUN_M <= run <= LENGTH_M[1]
+    if WIDTH_M[0] <= width <= WIDTH_M[1] and (is_one or is_row):
+        return "vehicle"
+    is_piece = bottom > RAISED_M and PIECE_M[0] <= width <= WIDTH_M[1] and PIECE_M[1] <= length <= LENGTH_M[1]
+    return "piece" if is_piece else "none"
+
+
+def _footprint_m(at: F64, cov: F64) -> tuple[float, float, float]:
+    """Width and length of the smallest upright box around a group, and the longest stretch of it without a gap."""
+    angle = np.arange(32) * (np.pi / 32)
+    along = np.stack([np.cos(angle), np.sin(angle)])
+    middle = at @ along
+    xx, xy, yy = (cov[:, k][:, None] for k in (0, 1, 3))
+    u, v = along
+    edge = EDGE_SIGMAS * np.sqrt(np.maximum(xx * u**2 + 2 * xy * u * v + yy * v**2, 0.0))
+    side = (middle + edge).max(axis=0) - (middle - edge).min(axis=0)
+    across = np.roll(side, -16)  # that of the direction 90 degrees on
+    best = int(np.argmin(side * across))
+    if side[best] < across[best]:
+        best = (best + 16) % 32
+    begin, end = middle[:, best] - edge[:, best], middle[:, best] + edge[:, best]
+    order = np.argsort(begin)
+    reached = np.maximum.accumulate(end[order])
+    breaks = np.flatnonzero(begin[order][1:] > reached[:-1] + GAP_M)
+    first = begin[order][np.append(0, breaks + 1)]
+    last = reached[np.append(breaks, len(order) - 1)]
+    return float(min(side[best], across[best])), float(side[best]), float((last - first).max())
+
+
+def groups_of(index: I64, members: I64) -> list[I64]:
+    """Put voxels that lie side by side, also across an edge or a corner, into groups.
+
+    Args:
+        index: (N, 3) column, row and floor of each voxel.
+        members: (K,) numbers of those that count.
+
+    Returns:
+        Their numbers, group by group.
+    """
+    if not len(members):
+        return []
+    pairs = KDTree(index[members]).query_pairs(BESIDE, output_type="ndarray")
+    n = len(members)
+    beside = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    label = connected_components(beside, directed=False)[1]
+    return np.split(members[np.argsort(label, kind="stable")], np.cumsum(np.bincount(label))[:-1])
+
+
+def _places_m(grid: VoxelGrid, gaussians: Gaussians) -> F64:
+    """(N, 3) means, east, north, up, against one corner of the tile at sea level."""
+    ix, iy, floor = grid.unravel(gaussians.voxel_id)
+    middle = np.stack([(ix + 0.5) * grid.dx_m, -(iy + 0.5) * grid.dy_m, (floor + 0.5) * grid.dz_m], axis=1)
+    return np.asarray(middle + gaussians.mean_m)
+
+
+def _flat_places_m(grid: VoxelGrid, gaussians: Gaussians) -> F64:
+    return _places_m(grid, gaussians.take(np.flatnonzero(gaussians.cov_m2[:, 5] < FLAT_SIGMA_M**2)))
+
+
+def _ground_m(place: F64, flat: F64) -> F64:
+    """(N,) height of the ground under each place: the median of what is flat near and below; NaN where nothing is."""
+    ground = np.full(len(place), np.nan)
+    if not len(flat):
+        return ground
+    for k, near in enumerate(KDTree(flat[:, :2]).query_ball_point(place[:, :2], GROUND_REACH_M)):
+        below = flat[near, 2]
+        below = below[(below < place[k, 2]) & (below > place[k, 2] - GROUND_BELOW_M)]
+        if len(below):
+            ground[k] = np.median(below)
+    return ground

@@ -1,0 +1,81 @@
+"""What has the shape of a vehicle, and what has not."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from things_testing import GRID, GROUND_M, box, car, gaussians, new_against, street
+
+from gnd.gnd_map.vehicle_shape import groups_of, has_vehicle_shape
+
+STREET = gaussians(street())
+MIDDLE = (15.0, -18.0)
+
+
+def share(*points, before=STREET):
+    """The share of the new voxels that have the shape of a vehicle."""
+    new = new_against(before, *points)
+    assert len(new)
+    return has_vehicle_shape(GRID, before, new).mean()
+
+
+@given(st.floats(0.0, np.pi), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(3.6, 5.2), st.floats(1.4, 1.9))
+@settings(max_examples=60, deadline=None)
+def test_a_car_is_one_wherever_and_however_it_stands(turned_rad, dx, dy, length, top):
+    assert share(car(MIDDLE[0] + dx, MIDDLE[1] + dy, turned_rad, length=length, top=top)) == 1.0
+
+
+@pytest.mark.parametrize("level_m", [40.02, 40.25, 40.5, 40.75, 40.98])
+def test_a_car_is_one_wherever_the_road_lies_in_its_voxels(level_m):
+    before = gaussians(street(level_m=level_m))
+    assert share(car(*MIDDLE, 0.5, ground_m=level_m), before=before) == 1.0
+
+
+@pytest.mark.parametrize("turned_rad", [0.0, 0.6, 1.57])
+def test_vans_rows_of_cars_and_boxes_that_stand_on_the_ground_are_vehicles(turned_rad):
+    along = np.array([np.cos(turned_rad), np.sin(turned_rad)])
+    row = [car(*(MIDDLE + k * 6.0 * along), turned_rad) for k in (-1, 0, 1)]
+    assert share(*row) == 1.0
+    assert share(box(*MIDDLE, 5.3, 2.0, GROUND_M + 0.3, GROUND_M + 2.5, turned_rad)) == 1.0  # a van
+    assert share(box(*MIDDLE, 4.5, 1.8, GROUND_M, GROUND_M + 1.5, turned_rad)) == 1.0  # a car as a box on the road
+
+
+@pytest.mark.parametrize("slope", [-0.12, 0.12])
+def test_a_car_on_a_steep_street_is_one(slope):
+    before = gaussians(street(slope))
+    x, y = MIDDLE
+    assert share(car(x, y, ground_m=GROUND_M + slope * x), before=before) == 1.0
+
+
+THINGS = {
+    "a wall": box(*MIDDLE, 12.0, 0.3, GROUND_M, GROUND_M + 1.6, 0.3),
+    "a house": box(*MIDDLE, 9.0, 8.0, GROUND_M, GROUND_M + 6.0),
+    "a tall container": box(*MIDDLE, 12.0, 2.5, GROUND_M, GROUND_M + 2.8),
+    "a pole": box(*MIDDLE, 0.2, 0.2, GROUND_M, GROUND_M + 6.0),
+    "a bollard": box(*MIDDLE, 0.2, 0.2, GROUND_M, GROUND_M + 1.0),
+    "a balcony": box(*MIDDLE, 4.0, 1.5, GROUND_M + 3.0, GROUND_M + 4.2),
+    "a kerb": box(*MIDDLE, 9.0, 2.0, GROUND_M, GROUND_M + 0.6),
+    "a field of rubble": box(*MIDDLE, 11.0, 10.0, GROUND_M, GROUND_M + 1.5),
+}
+
+
+@pytest.mark.parametrize("thing", THINGS)
+def test_what_is_no_vehicle_is_none(thing):
+    assert share(THINGS[thing]) == 0.0
+
+
+def test_a_car_beside_a_house_is_one_and_the_house_is_none():
+    x, y = MIDDLE
+    parked, house = new_against(STREET, car(x, y)), new_against(STREET, box(x, y + 4.1, 9.0, 5.0, GROUND_M, 47.0))
+    both = new_against(STREET, car(x, y), box(x, y + 4.1, 9.0, 5.0, GROUND_M, 47.0))
+    assert len(groups_of(np.stack(GRID.unravel(both.voxel_id), 1), np.arange(len(both)))) == 1  # they touch
+    found = has_vehicle_shape(GRID, STREET, both)
+    own = np.isin(both.voxel_id, parked.voxel_id) & ~np.isin(both.voxel_id, house.voxel_id)
+    assert found[own].mean() > 0.9
+    assert found[~own].mean() < 0.1
+
+
+def test_where_the_map_has_no_ground_nobody_knows():
+    empty = STREET.take(np.zeros(0, np.int64))
+    assert not has_vehicle_shape(GRID, empty, gaussians(car(*MIDDLE))).any()
+    assert len(has_vehicle_shape(GRID, STREET, empty)) == 0
