@@ -20,10 +20,10 @@ from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.merge import MergedTile
 from gnd.cloud_merger.statements import REMEMBERED, Report, Witness
 from gnd.gnd_map.arrays import I32, I64, are_in, unique
+from gnd.gnd_map.beside import group_numbers
 from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
-from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.changes import TileChange
 from gnd.tile_store.values import Unconfirmed, WaitingReason
@@ -183,30 +183,10 @@ def _isolated(epoch: Gaussians, merged: MergedTile, reports: Iterable[Report], t
     return frozenset(voxels[together < together_voxels].tolist())
 
 
-@kernel
 def changes_together(x: I64, y: I64, floor: I64, counts: NDArray[np.bool_]) -> I64:
     """(N,) how many of those that count are in the group of each voxel, voxel beside voxel; `floor` ascends."""
-    n = len(x)
-    group = np.arange(n)
-    for i in range(n):
-        for j in range(i + 1, n):
-            if floor[j] - floor[i] > 1:
-                break
-            if abs(x[i] - x[j]) <= 1 and abs(y[i] - y[j]) <= 1:
-                a, b = _root(group, i), _root(group, j)
-                group[max(a, b)] = min(a, b)
-    size = np.zeros(n, np.int64)
-    for i in range(n):
-        size[_root(group, i)] += 1 if counts[i] else 0
-    return np.array([size[_root(group, i)] for i in range(n)])
-
-
-@kernel
-def _root(group: I64, i: int) -> int:
-    while group[i] != i:
-        group[i] = group[group[i]]
-        i = group[i]
-    return i
+    group = group_numbers(x, y, floor)
+    return np.bincount(group, weights=counts, minlength=len(x)).astype(np.int64)[group]
 
 
 def _waiting_of(

@@ -18,10 +18,11 @@ from gnd.cloud_merger.memory import PARKED, ParkedVoxels
 from gnd.cloud_merger.merge import MergedTile
 from gnd.cloud_merger.statements import Kind, Report, changed_of, find
 from gnd.gnd_map.arrays import I32, I64, are_in, unique
+from gnd.gnd_map.beside import groups_of
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile_id import TileId
-from gnd.gnd_map.vehicle_shape import groups_of, has_vehicle_shape
+from gnd.gnd_map.vehicle_shape import has_vehicle_shape
 from gnd.tile_store.values import Unconfirmed
 
 PARKED_MOST_H: Final = 14 * 24.0

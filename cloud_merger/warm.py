@@ -24,6 +24,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.similarity import similarity
 from gnd.gnd_map.tile_id import TileId
 from gnd.gnd_map.track import STEPS, Track, TrackPiece, TrackView
+from gnd.gnd_map.vehicle_shape import warm_up as warm_up_shapes
 from gnd.gnd_map.visibility import observed_along
 from gnd.schemas.changes import TileChange
 from gnd.tile_store.warm import warm_up as warm_up_codecs
@@ -46,6 +47,7 @@ def warm_up() -> None:
     decided(np.zeros(1, STATEMENT), base, MergeParameters())
     place = np.zeros(1, np.int64)
     changes_together(place, place, place, np.ones(1, np.bool_))
+    warm_up_shapes()
     _test_a_shift()
 
 

@@ -10,13 +10,12 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.beside import groups_of
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.jit import kernel
 
 Mask = NDArray[np.bool_]
 Shape = Literal["none", "piece", "vehicle"]
@@ -27,8 +26,6 @@ FLAT_SIGMA_M: Final = 0.12
 """A Gaussian no thicker than this from bottom to top is a piece of ground, where it lies below what stands."""
 EDGE_SIGMAS: Final = 1.7
 """A surface that fills a voxel evenly ends at √3 of its standard deviations."""
-BESIDE: Final = 1.8
-"""Voxels side by side, also across an edge or a corner, are of one thing."""
 BOTTOM_M: Final = 1.2
 """What begins higher over the ground than a car's belt line does not stand on wheels."""
 TOP_M: Final = (0.9, 2.3)
@@ -67,8 +64,10 @@ def has_vehicle_shape(grid: VoxelGrid, before: Gaussians, new: Gaussians) -> Mas
     if not len(new):
         return found
     flat = _flat_places_m(grid, before)
+    if not len(flat):
+        return found
     place = _places_m(grid, new)
-    ground = _ground_m(place, flat)
+    ground = _ground_m(place, flat, GROUND_REACH_M, GROUND_BELOW_M)
     spread = EDGE_SIGMAS * np.sqrt(np.maximum(new.cov_m2[:, 5].astype(np.float64), 0.0))
     low, top = place[:, 2] - spread - ground, place[:, 2] + spread - ground
     index = np.stack(grid.unravel(new.voxel_id), axis=1)
@@ -90,13 +89,6 @@ def _is_low_column(index: I64, top: F64) -> Mask:
     highest = np.full(int(column.max()) + 1, -np.inf)
     np.fmax.at(highest, column, top)
     return np.asarray(highest[column] <= TOP_M[1])
-
-
-def _contact(index: I64, others: I64) -> float:
-    """The share of a thing's voxels that lie beside others."""
-    if not len(others):
-        return 0.0
-    return float((KDTree(others).query(index)[0] < BESIDE).mean())
 
 
 def _shape(low: F64, top: F64, at: F64, cov: F64, *, in_row: bool = True) -> Shape:
@@ -145,25 +137,6 @@ def _footprint_m(at: F64, cov: F64) -> tuple[float, float, float]:
     return float(min(side[best], across[best])), float(side[best]), float((last - first).max())
 
 
-def groups_of(index: I64, members: I64) -> list[I64]:
-    """Put voxels that lie side by side, also across an edge or a corner, into groups.
-
-    Args:
-        index: (N, 3) column, row and floor of each voxel.
-        members: (K,) numbers of those that count.
-
-    Returns:
-        Their numbers, group by group.
-    """
-    if not len(members):
-        return []
-    pairs = KDTree(index[members]).query_pairs(BESIDE, output_type="ndarray")
-    n = len(members)
-    beside = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    label = connected_components(beside, directed=False)[1]
-    return np.split(members[np.argsort(label, kind="stable")], np.cumsum(np.bincount(label))[:-1])
-
-
 def _places_m(grid: VoxelGrid, gaussians: Gaussians) -> F64:
     """(N, 3) means, east, north, up, against one corner of the tile at sea level."""
     ix, iy, floor = grid.unravel(gaussians.voxel_id)
@@ -175,14 +148,42 @@ def _flat_places_m(grid: VoxelGrid, gaussians: Gaussians) -> F64:
     return _places_m(grid, gaussians.take(np.flatnonzero(gaussians.cov_m2[:, 5] < FLAT_SIGMA_M**2)))
 
 
-def _ground_m(place: F64, flat: F64) -> F64:
+@kernel
+def _ground_m(place: F64, flat: F64, reach_m: float, below_m: float) -> F64:
     """(N,) height of the ground under each place: the median of what is flat near and below; NaN where nothing is."""
     ground = np.full(len(place), np.nan)
-    if not len(flat):
-        return ground
-    for k, near in enumerate(KDTree(flat[:, :2]).query_ball_point(place[:, :2], GROUND_REACH_M)):
-        below = flat[near, 2]
-        below = below[(below < place[k, 2]) & (below > place[k, 2] - GROUND_BELOW_M)]
-        if len(below):
-            ground[k] = np.median(below)
+    near = np.empty(len(flat))
+    for k in range(len(place)):
+        n = 0
+        x, y, z = place[k]
+        for j in range(len(flat)):
+            if z - below_m < flat[j, 2] < z and (flat[j, 0] - x) ** 2 + (flat[j, 1] - y) ** 2 <= reach_m**2:
+                near[n] = flat[j, 2]
+                n += 1
+        if n:
+            ground[k] = np.median(near[:n])
     return ground
+
+
+@kernel
+def _touching(index: I64, others: I64) -> int:
+    """How many voxels lie beside one of the others."""
+    n = 0
+    for i in range(len(index)):
+        for j in range(len(others)):
+            if (
+                abs(index[i, 0] - others[j, 0]) <= 1
+                and abs(index[i, 1] - others[j, 1]) <= 1
+                and abs(index[i, 2] - others[j, 2]) <= 1
+            ):
+                n += 1
+                break
+    return n
+
+
+def warm_up() -> None:
+    """Compile or load the kernels."""
+    index, place = np.zeros((1, 3), np.int64), np.zeros((1, 3))
+    groups_of(index, np.zeros(1, np.int64))
+    _ground_m(place, place, 1.0, 1.0)
+    _touching(index, index)

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 from things_testing import GRID, GROUND_M, box, car, gaussians, new_against, street
 
-from gnd.gnd_map.vehicle_shape import groups_of, has_vehicle_shape
+from gnd.gnd_map.beside import groups_of
+from gnd.gnd_map.vehicle_shape import GROUND_BELOW_M, GROUND_REACH_M, _ground_m, _touching, has_vehicle_shape
 
 STREET = gaussians(street())
 MIDDLE = (15.0, -18.0)
@@ -79,3 +81,30 @@ def test_where_the_map_has_no_ground_nobody_knows():
     empty = STREET.take(np.zeros(0, np.int64))
     assert not has_vehicle_shape(GRID, empty, gaussians(car(*MIDDLE))).any()
     assert len(has_vehicle_shape(GRID, STREET, empty)) == 0
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 6)] * 3), min_size=1, max_size=60, unique=True))
+@settings(max_examples=100, deadline=None)
+def test_groups_are_those_of_a_graph_of_neighbours(voxels):
+    index = np.array(voxels, np.int64)
+    near = (np.abs(index[:, None] - index[None]) <= 1).all(axis=2)
+    label = connected_components(near, directed=False)[1]
+    plain = sorted(np.flatnonzero(label == k).tolist() for k in range(label.max() + 1))
+    assert sorted(one.tolist() for one in groups_of(index, np.arange(len(index)))) == plain
+
+
+def test_the_ground_is_the_median_of_what_is_flat_near_and_below():
+    rng = np.random.default_rng(3)
+    place, flat = rng.uniform([0, 0, 0], [12, 12, 6], (80, 3)), rng.uniform([0, 0, 0], [12, 12, 6], (150, 3))
+    found = _ground_m(place, flat, GROUND_REACH_M, GROUND_BELOW_M)
+    for (x, y, z), height in zip(place, found, strict=True):
+        near = np.hypot(flat[:, 0] - x, flat[:, 1] - y) <= GROUND_REACH_M
+        below = flat[near & (flat[:, 2] < z) & (flat[:, 2] > z - GROUND_BELOW_M), 2]
+        assert np.isnan(height) if not len(below) else height == np.median(below)
+
+
+def test_voxels_that_touch_are_counted_as_a_tree_counts_them():
+    rng = np.random.default_rng(4)
+    one, other = rng.integers(0, 9, (60, 3)), rng.integers(0, 9, (40, 3))
+    plain = (np.abs(one[:, None] - other[None]).max(axis=2) <= 1).any(axis=1).sum()
+    assert _touching(one, other) == plain
