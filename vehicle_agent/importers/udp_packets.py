@@ -70,6 +70,7 @@ class Capture:
             MissingExtra: dpkt is not installed.
         """
         reader_of = library("dpkt.pcap", EXTRA).UniversalReader
+        damage: type[Exception] = library("dpkt", EXTRA).dpkt.Error
         self.incomplete, self.damaged = 0, ""
         with self.path.open("rb") as stream:
             try:
@@ -79,7 +80,7 @@ class Capture:
                     found = self._udp(_ip_packet(link, frame))
                     if found is not None:
                         yield UdpPacket(round(stamp_s * 1_000_000_000), *found)
-            except (ValueError, struct.error, *_errors()) as error:
+            except (ValueError, struct.error, damage) as error:
                 self.damaged = " ".join(str(error).split())[:200] or type(error).__name__
         self.incomplete += len(self._pending)
         self._pending.clear()
@@ -124,11 +125,6 @@ class Capture:
     def _give_up(self, key: tuple[bytes, int]) -> None:
         del self._pending[key]
         self.incomplete += 1
-
-
-def _errors() -> tuple[type[Exception], ...]:
-    """What dpkt raises on damaged files."""
-    return (library("dpkt", EXTRA).dpkt.Error,)
 
 
 def _ip_packet(link: int, frame: bytes) -> bytes:

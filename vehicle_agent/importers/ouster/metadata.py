@@ -19,6 +19,8 @@ from gnd.vehicle_agent.importers.ouster.packets import PROFILES, LidarProfile
 F64 = NDArray[np.float64]
 
 MAX_BYTES: Final = 10 << 20
+ROUNDED: Final = 1e-3
+"""Rotations with three decimals are rotations."""
 _GROUPS: Final = (
     "sensor_info", "beam_intrinsics", "lidar_intrinsics", "lidar_data_format", "data_format", "config_params",
     "ouster-sdk",
@@ -58,11 +60,8 @@ class OusterMetadata:
                 f"{self.path}: {self.columns} columns a frame, {self.columns_per_packet} a packet, window {self.window}"
             )
         for T in (self.T_lidar_beam, self.T_sensor_lidar):
-            if (
-                T.shape != (4, 4)
-                or not np.isfinite(T).all()
-                or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3
-            ):
+            R = T[:3, :3]
+            if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > ROUNDED:
                 raise ImportDriveError(f"{self.path}: a transform that is no rigid 4x4 matrix: {T.tolist()}")
 
     @property
