@@ -14,7 +14,7 @@ from gnd.vehicle_agent.importers.ouster.metadata import read_metadata
 from gnd.vehicle_agent.importers.ouster.packets import PROFILES, packet_dtype, ranges_mm
 from gnd.vehicle_agent.importers.ouster.points import PointTable
 from gnd.vehicle_agent.importers.recording import RecordingAnchor
-from gnd.vehicle_agent.importers.udp_packets import Capture
+from gnd.vehicle_agent.importers.udp_packets import UdpCapture
 
 GOLDEN = Path(__file__).parent / "ouster_golden"
 ANCHOR = RecordingAnchor(48.1, 11.5, 520.0)
@@ -62,7 +62,7 @@ def test_each_profile_is_read_as_ousters_own_library_does(tmp_path, profile, for
 def test_points_agree_before_they_are_rounded(profile):
     golden, metadata = np.load(GOLDEN / f"{profile}.npz"), read_metadata(GOLDEN / f"{profile}.json")
     layout = packet_dtype(metadata.profile, 8, 16)
-    packets = [np.frombuffer(one.payload, layout)[0] for one in Capture(GOLDEN / f"{profile}.pcap").packets()]
+    packets = [np.frombuffer(one.payload, layout)[0] for one in UdpCapture(GOLDEN / f"{profile}.pcap").packets()]
     columns = np.stack(packets)["columns"][2:4].reshape(-1)
     for k, range_mm in enumerate(ranges_mm(metadata.profile, columns["pixels"])):
         hit = (range_mm > 0) & ((columns["status"] & 1) > 0)[:, None]
@@ -73,7 +73,7 @@ def test_points_agree_before_they_are_rounded(profile):
 def test_a_wrong_layout_is_noticed(tmp_path):
     """The comparison can fail: the same bytes as the single return of another profile give other ranges."""
     golden, metadata = np.load(GOLDEN / "RNG15_RFL8_NIR8_DUAL.npz"), read_metadata(GOLDEN / "RNG15_RFL8_NIR8_DUAL.json")
-    packet = next(Capture(GOLDEN / "RNG15_RFL8_NIR8_DUAL.pcap").packets()).payload
+    packet = next(UdpCapture(GOLDEN / "RNG15_RFL8_NIR8_DUAL.pcap").packets()).payload
     for profile, same in ((PROFILES["RNG15_RFL8_NIR8_ZONE16"], True), (PROFILES["RNG19_RFL8_SIG16_NIR16"], False)):
         if profile.packet_bytes(8, 16) <= len(packet):
             columns = np.frombuffer(packet, packet_dtype(profile, 8, 16), 1)[0]["columns"]
@@ -90,7 +90,7 @@ def test_a_real_capture_has_the_ranges_and_times_that_ouster_publishes(shared_da
     digest = json.loads(place.with_name(place.stem + "_digest.json").read_text())["scans"][0]
     metadata = read_metadata(place.with_suffix(".json"))
     layout = packet_dtype(metadata.profile, metadata.n_beams, metadata.columns_per_packet)
-    data = [one.payload for one in Capture(place).packets() if len(one.payload) == metadata.packet_bytes]
+    data = [one.payload for one in UdpCapture(place).packets() if len(one.payload) == metadata.packet_bytes]
     packets = np.frombuffer(b"".join(data), layout)
     assert {int(one) for one in packets["frame_id"]} == {int(digest["FRAME_ID"])}
     columns = packets["columns"].reshape(-1)

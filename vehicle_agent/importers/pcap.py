@@ -19,7 +19,7 @@ from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.files import files_below
 from gnd.vehicle_agent.importers.optional import library
-from gnd.vehicle_agent.importers.ouster.capture import Streams, metadata_named, open_ouster
+from gnd.vehicle_agent.importers.ouster.capture import UdpStreams, metadata_named, open_ouster
 from gnd.vehicle_agent.importers.ouster.packets import kinds_of_size
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
 
@@ -48,7 +48,7 @@ def open_pcap(path: Path, anchor: RecordingAnchor | None, choices: Choices | Non
         MissingExtra: velodyne-decoder is not installed.
     """
     path = _file(path)
-    streams = Streams.of(path)
+    streams = UdpStreams.of(path)
     sizes = streams.by_size
     if not sizes:
         reason = streams.capture.damaged or f"no whole UDP packet, {streams.capture.incomplete} in part"

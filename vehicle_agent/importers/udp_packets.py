@@ -50,7 +50,7 @@ class _Pieces:
 
 
 @dataclass(slots=True)
-class Capture:
+class UdpCapture:
     """A capture's packets, in their order.
 
     incomplete: packets cut off or without some of their pieces, known once `packets` was read to its end. damaged: why

@@ -14,14 +14,14 @@ from gnd.vehicle_agent.importers.ouster.frames import OusterFrames
 from gnd.vehicle_agent.importers.ouster.metadata import OusterMetadata, is_metadata, read_metadata
 from gnd.vehicle_agent.importers.ouster.packets import is_lidar, kinds_of_size, serial_of
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
-from gnd.vehicle_agent.importers.udp_packets import Capture
+from gnd.vehicle_agent.importers.udp_packets import UdpCapture
 
 IMU_BYTES: Final = 48
 DAMAGED: Final = "the capture is damaged after {n} packets, the rest is left out: {why}"
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Stream:
+class UdpStream:
     """Where packets come from, and the port that they go to."""
 
     source: str
@@ -32,22 +32,22 @@ class Stream:
 
 
 @dataclass(slots=True)
-class Streams:
+class UdpStreams:
     """What a capture holds: packets of each length in each stream, and the serial numbers that they may say.
 
     firsts: the first packet of each stream and length.
     """
 
-    capture: Capture
-    sizes: dict[Stream, Counter[int]] = field(default_factory=dict)
-    firsts: dict[tuple[Stream, int], bytes] = field(default_factory=dict)
+    capture: UdpCapture
+    sizes: dict[UdpStream, Counter[int]] = field(default_factory=dict)
+    firsts: dict[tuple[UdpStream, int], bytes] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, path: Path) -> "Streams":
+    def of(cls, path: Path) -> "UdpStreams":
         """Read a capture once; what can be read before a damage counts."""
-        found = cls(Capture(path))
+        found = cls(UdpCapture(path))
         for one in found.capture.packets():
-            stream, size = Stream(one.source, one.port), len(one.payload)
+            stream, size = UdpStream(one.source, one.port), len(one.payload)
             found.sizes.setdefault(stream, Counter())[size] += 1
             found.firsts.setdefault((stream, size), one.payload)
         return found
@@ -57,8 +57,8 @@ class Streams:
         """Packets of each length."""
         return sum(self.sizes.values(), Counter())
 
-    def of_ouster(self, known: Sequence[OusterMetadata] = ()) -> list[tuple[Stream, int]]:
-        """Streams, with the length, that look like an Ouster's lidar packets: of a usual setting or of these."""
+    def of_ouster(self, known: Sequence[OusterMetadata] = ()) -> list[tuple[UdpStream, int]]:
+        """UdpStreams, with the length, that look like an Ouster's lidar packets: of a usual setting or of these."""
         found = []
         for (stream, size), payload in self.firsts.items():
             kinds = [profile for profile, _ in kinds_of_size(size)]
@@ -69,7 +69,7 @@ class Streams:
 
 
 def open_ouster(
-    path: Path, streams: Streams, anchor: RecordingAnchor | None, choices: Choices | None = None
+    path: Path, streams: UdpStreams, anchor: RecordingAnchor | None, choices: Choices | None = None
 ) -> Recording | None:
     """The frames of one sensor; `anchor` says where on the Earth the first pose lies. None: no packets of an Ouster.
 
@@ -109,10 +109,10 @@ def open_ouster(
     )
 
 
-def _frames(path: Path, stream: Stream, metadata: OusterMetadata) -> tuple[OusterFrames, int]:
+def _frames(path: Path, stream: UdpStream, metadata: OusterMetadata) -> tuple[OusterFrames, int]:
     """Frames of a stream, and how many of its packets of the right length are none of points."""
     frames, wrong = OusterFrames(metadata), 0
-    for one in Capture(path).packets():
+    for one in UdpCapture(path).packets():
         if (one.source, one.port) != (stream.source, stream.port) or len(one.payload) != metadata.packet_bytes:
             continue
         if is_lidar(metadata.profile, one.payload):
@@ -123,7 +123,7 @@ def _frames(path: Path, stream: Stream, metadata: OusterMetadata) -> tuple[Ouste
     return frames, wrong
 
 
-def _notes(streams: Streams, frames: OusterFrames, wrong: int) -> tuple[str, ...]:
+def _notes(streams: UdpStreams, frames: OusterFrames, wrong: int) -> tuple[str, ...]:
     notes = list(frames.notes)
     if frames.left_out:
         notes.append(f"{frames.left_out} frames cut off by the capture: left out")
@@ -136,7 +136,7 @@ def _notes(streams: Streams, frames: OusterFrames, wrong: int) -> tuple[str, ...
     return tuple(notes)
 
 
-def _entries(streams: Streams, chosen: Stream, metadata: OusterMetadata) -> tuple[Entry, ...]:
+def _entries(streams: UdpStreams, chosen: UdpStream, metadata: OusterMetadata) -> tuple[Entry, ...]:
     """Every stream and length, what it is and what it is used for."""
     clock = metadata.timestamp_mode or "timestamp mode not said"
     detail = f"{metadata.product}, {metadata.profile.name}, {metadata.n_beams} beams, {clock}"
@@ -180,8 +180,8 @@ def _candidates(path: Path, choices: Choices) -> list[OusterMetadata]:
 
 
 def _chosen(
-    path: Path, streams: Streams, candidates: Sequence[OusterMetadata], wanted: str | None
-) -> tuple[Stream, OusterMetadata]:
+    path: Path, streams: UdpStreams, candidates: Sequence[OusterMetadata], wanted: str | None
+) -> tuple[UdpStream, OusterMetadata]:
     """The stream that is imported, and its metadata.
 
     Raises:
@@ -210,13 +210,15 @@ def _chosen(
     return fitting[0]
 
 
-def _is_wanted(stream: Stream, first: bytes, candidates: Sequence[OusterMetadata], wanted: str | None) -> bool:
+def _is_wanted(stream: UdpStream, first: bytes, candidates: Sequence[OusterMetadata], wanted: str | None) -> bool:
     names = {stream.source, str(stream.port), f"{stream.source}:{stream.port}"}
     profiles = [profile for profile, _ in kinds_of_size(len(first))] + [one.profile for one in candidates]
     return wanted is None or wanted in names | {str(serial_of(profile, first)) for profile in profiles}
 
 
-def _fitting(streams: Streams, stream: Stream, size: int, candidates: Sequence[OusterMetadata]) -> list[OusterMetadata]:
+def _fitting(
+    streams: UdpStreams, stream: UdpStream, size: int, candidates: Sequence[OusterMetadata]
+) -> list[OusterMetadata]:
     """Metadata of this length of packets: of this serial number where packets say one, else rather of this port."""
     first = streams.firsts[stream, size]
     fitting = [one for one in candidates if one.packet_bytes == size and is_lidar(one.profile, first)]
@@ -226,11 +228,11 @@ def _fitting(streams: Streams, stream: Stream, size: int, candidates: Sequence[O
     return [one for one in fitting if one.port_lidar == stream.port] or fitting
 
 
-def _sizes_text(streams: Streams) -> str:
+def _sizes_text(streams: UdpStreams) -> str:
     return ", ".join(f"{n} packets of {size} bytes" for size, n in streams.by_size.most_common(4))
 
 
-def _why_none(streams: Streams, candidates: Sequence[OusterMetadata]) -> str:
+def _why_none(streams: UdpStreams, candidates: Sequence[OusterMetadata]) -> str:
     """What the packets are, and what the metadata say."""
     said = "; ".join(
         f"{one.path.name} is of {one.product} {one.serial or ''}: {one.profile.name}, {one.n_beams} beams, packets of"
