@@ -7,8 +7,8 @@ this follows what stands (8.0 m); point-to-point neighbours (small_gicp) stayed 
 and then broke.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from itertools import takewhile
 from typing import Final
 
 import numpy as np
@@ -216,16 +216,17 @@ class _Odometry:
 
     def _still_mapped(self, found: Sequence[FoundPose]) -> set[int]:
         """Numbers of the scans that no forgetting after them removes wholly from the map."""
-        forgot_m, forgets = self._forgot_m, list[tuple[int, frozenset[TileId]]]()
+        forgot_m, at, kept = self._forgot_m, list[int](), list[frozenset[TileId]]()
         for pose in found:
             if np.linalg.norm(pose.T[:3, 3] - forgot_m) > NEAR_M:
                 forgot_m = pose.T[:3, 3]
-                forgets.append((pose.number, self._map.kept(forgot_m)))
+                at.append(pose.number)
+                kept.append(self._map.kept(forgot_m))
         mapped = set[int]()
         for pose in found:
             reached = self._map.reached(pose.T[:3, 3])
-            after = takewhile(lambda forget, pose=pose: forget[0] >= pose.number, reversed(forgets))
-            if not any(reached.isdisjoint(kept) for _, kept in after):
+            after = kept[bisect_left(at, pose.number) :]
+            if not any(reached.isdisjoint(tiles) for tiles in reversed(after)):
                 mapped.add(pose.number)
         return mapped
 
