@@ -30,8 +30,10 @@ from gnd.tile_store.export import ExportError
 from gnd.vehicle_agent.sources.ros2_messages import BadRosMessage
 from gnd.vehicle_agent.sources.ros2_services import RosServiceType
 
-DIFFERENTIAL: Final = "/map/get_differential_pointcloud_map"
-PARTIAL: Final = "/map/get_partial_pointcloud_map"
+NAMESPACE: Final = "/map"
+"""Where Autoware's launch files look for the services."""
+DIFFERENTIAL: Final = "get_differential_pointcloud_map"
+PARTIAL: Final = "get_partial_pointcloud_map"
 MOST_BYTES: Final = MAX_MESSAGE_BYTES - 65_536
 """Of an answer; the rest is for what zenoh puts around it."""
 _ID_BYTES: Final = 8  # length and end of a text in CDR, aligned
@@ -45,15 +47,23 @@ class MapService:
     Args:
         node: of which the services are.
         served: the map.
+        namespace: of the services.
         limit_bytes: the largest answer; of cells that do not fit, the farthest are left for the next request.
     """
 
-    def __init__(self, node: RosNode, served: ServedMap, limit_bytes: int = MOST_BYTES) -> None:
+    def __init__(
+        self, node: RosNode, served: ServedMap, namespace: str = NAMESPACE, limit_bytes: int = MOST_BYTES
+    ) -> None:
         self._served, self._limit_bytes = served, limit_bytes
         self._parts: tuple[RosService, ...] = (
-            self._serve(node, DIFFERENTIAL, differential_service()),
-            self._serve(node, PARTIAL, partial_service()),
+            self._serve(node, f"{namespace}/{DIFFERENTIAL}", differential_service()),
+            self._serve(node, f"{namespace}/{PARTIAL}", partial_service()),
         )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the services."""
+        return tuple(part.name for part in self._parts)
 
     @property
     def answered(self) -> int:

@@ -76,6 +76,11 @@ class ServedMap:
         """How many cells there are."""
         return len(self._corners)
 
+    @property
+    def tiles(self) -> int:
+        """How many tiles there are."""
+        return len(self._tiles)
+
     def replace(self, tiles: Iterable[Tile]) -> ChangedCells:
         """Take new versions of tiles into the map: the cells that they touch, or touched, are made anew.
 
