@@ -87,13 +87,13 @@ def read_answer(payload: bytes, *, partial: bool = False) -> Answer:
 
 def request(x: float, y: float, radius: float, ids=None) -> bytes:
     """CDR of GetDifferentialPointCloudMap_Request; without `ids` that of GetPartialPointCloudMap_Request."""
-    made = struct.pack("<fff", x, y, radius)
+    made = bytearray(struct.pack("<fff", x, y, radius))
     if ids is not None:
         made += struct.pack("<I", len(ids))
         for one in ids:
             text = one.encode() + b"\x00"
             made += bytes(-len(made) % 4) + struct.pack("<I", len(text)) + text
-    return b"\x00\x01\x00\x00" + made
+    return b"\x00\x01\x00\x00" + bytes(made)
 
 
 class AutowareClient:
