@@ -2,6 +2,7 @@
 
 import json
 import queue
+import re
 import signal
 import subprocess
 import sys
@@ -15,11 +16,13 @@ import pytest
 from autoware_client import AutowareClient
 from click.testing import CliRunner
 from map_export_maps import TILE, some_tile
+from test_export_page import NUMBER, PAGE, make_maps
 
 from gnd.deploy.cli import gnd
 from gnd.deploy.map_export.autoware import read_metadata
 from gnd.fleet_bus.router import open_router
 from gnd.gnd_map.tile import Tile
+from gnd.tile_store.export import region_tiles
 from gnd.tile_store.sqlite_store import SqliteStore
 
 CTRL_C_S = 1.0
@@ -129,3 +132,33 @@ def test_what_it_cannot_serve_it_refuses(tmp_path: Path, free_port: int, monkeyp
         ran = CliRunner().invoke(gnd, ["map", "serve", *words.split()])
         assert ran.exit_code != 0
         assert says in ran.output + str(ran.exception), words
+
+
+@pytest.mark.slow
+def test_the_page_shows_what_the_command_prints(tmp_path: Path, endpoint: str, serve: Callable[..., Serve]) -> None:
+    make_maps(tmp_path)
+    command, *wanted = next(
+        block.splitlines()
+        for block in re.findall(r"```console\n(.*?)```", PAGE.read_text(), re.DOTALL)
+        if "serve" in block
+    )
+    served = serve(*command.removeprefix("$ gnd map serve ").split(), "--connect", endpoint)
+    printed = [served.line(), served.line()]
+    with (
+        AutowareClient(endpoint) as client,
+        SqliteStore(tmp_path / "base.sqlite") as base,
+        SqliteStore(tmp_path / "after.sqlite", create=False) as after,
+    ):
+        client.wait_served()
+        client.update(0.0, 0.0, 150.0)
+        tile = max(region_tiles(after, "ndt", ""), key=lambda one: len(one.gaussians))
+        base.put_tiles([tile])  # as a merger publishes what the fleet has seen
+        printed += [served.line(), "^C"]
+        client.update(0.0, 0.0, 150.0)
+        assert client.held.keys() == read_metadata(tmp_path / "autoware").keys()
+    printed.append(served.interrupt()[0])
+    print("\n".join(printed))
+    assert [NUMBER.sub("#", line) for line in printed] == [NUMBER.sub("#", line) for line in wanted]
+    for line, on_page in zip(printed, wanted, strict=True):
+        numbers = [[float(n.rstrip(".")) for n in NUMBER.findall(text)] for text in (line, on_page)]
+        assert numbers[0] == pytest.approx(numbers[1], rel=0.02, abs=0.011), (line, on_page)
