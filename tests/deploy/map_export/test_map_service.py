@@ -17,6 +17,7 @@ from map_export_maps import TILE, some_tile
 from zenoh import ext
 
 from gnd.cloud_merger.announce import encoded, update_of
+from gnd.deploy.map_export import autoware
 from gnd.deploy.map_export.autoware import CLOUDS, PROJECTOR, export_autoware, read_metadata
 from gnd.deploy.map_export.autoware_messages import partial_service
 from gnd.deploy.map_export.map_service import MapService
@@ -307,3 +308,48 @@ def test_a_store_is_followed_whoever_writes_it(fleet: Fleet, tmp_path: Path) -> 
     found: list[Tile] = []
     wait_until(lambda: found.extend(feed.newer()) or found, "the new version")
     assert [(tile.tile_id, tile.version) for tile in found] == [(TILE, 2)]
+
+
+class Given:
+    """A feed that gives what it is told."""
+
+    def __init__(self, *tiles: Tile) -> None:
+        self.tiles, self.waits = list(tiles), 0
+
+    def all(self) -> list[Tile]:
+        return self.tiles
+
+    def newer(self) -> list[Tile]:
+        time.sleep(0.01)
+        self.waits += 1
+        given, self.tiles = self.tiles, []
+        return given
+
+
+def test_what_cannot_be_written_now_is_written_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    served = ServedMap(tmp_path, [some_tile(1)], None, "means")
+    before, plain, full = read_metadata(tmp_path), autoware._write, threading.Event()
+
+    def write(path: Path, data: bytes) -> None:
+        if full.is_set():
+            raise OSError(28, "No space left on device")
+        plain(path, data)
+
+    monkeypatch.setattr(autoware, "_write", write)
+    full.set()
+    berlin = some_tile(5, TileId.from_geodetic(np.radians(52.5), np.radians(13.4)))
+    feed, stop, told = Given(berlin, Tile(TILE, 2, some_tile(7).gaussians)), threading.Event(), []
+    thread = threading.Thread(target=follow, args=(feed, served, stop, told.append))
+    thread.start()
+    wait_until(lambda: feed.waits > 5, "some rounds")
+    assert read_metadata(tmp_path) == before
+    assert caplog.text.count("No space left") == 1  # said once, tried again and again
+    assert caplog.text.count(f"tile {berlin.tile_id.path} is not served") == 1  # 570 km away
+    full.clear()
+    wait_until(lambda: told, "the tile")
+    stop.set()
+    thread.join()
+    assert told[0].values["tile"] == TILE.path
+    assert read_metadata(tmp_path).keys() == {path.name for path in (tmp_path / CLOUDS).iterdir()} != before.keys()
