@@ -101,9 +101,12 @@ class AutowareClient:
 
     def __init__(self, endpoint: str, *, domain: int = 0, type_hash: str = HASH, namespace: str = "map") -> None:
         config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
+        # as DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5: a peer that knows the router
+        config.insert_json5("mode", '"peer"')
         config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+        config.insert_json5("listen/endpoints", '["tcp/localhost:0"]')
         config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("scouting/gossip/enabled", "true")
         self.session = zenoh.open(config)
         self.key = f"{domain}/{namespace}/get_differential_pointcloud_map/{SERVICE}/{type_hash}"
         self._numbers = itertools.count(1)

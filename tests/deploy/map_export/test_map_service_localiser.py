@@ -1,6 +1,7 @@
 """A localiser that knows the map from the service alone finds the pose that it finds on the whole export."""
 
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,10 @@ def check_drive(folder: Path, drive: Path, every: int, every_m: float, endpoint:
                 start = plane.pose(beside(T, rng))
                 x, y = start[:2, 3]
                 if not np.hypot(*(asked_m - (x, y))) < every_m:
-                    client.update(float(x), float(y), RANGE_M + every_m)
+                    began_s = time.monotonic()
+                    answer = client.update(float(x), float(y), RANGE_M + every_m)
+                    size_mb = sum(cell.points.nbytes for cell in answer.new.values()) / 1e6
+                    print(f"{len(answer.new)} cells, {size_mb:.2f} MB, in {1e3 * (time.monotonic() - began_s):.0f} ms")
                     held, asked_m, moved = np.concatenate(list(client.held.values())), np.array((x, y)), moved + 1
                     on_held, ndt_on_held = vgicp(held.astype(float)), ndt_of(held.astype(float))
                 few = points[rng.permutation(len(points))[:3000]]
