@@ -13,6 +13,7 @@ from gnd.fleet_bus.errors import BusConfigError
 from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.export import ExportError, region_tiles
 from gnd.tile_store.options import to_read
 from gnd.tile_store.store import Store
@@ -45,7 +46,7 @@ class StoreFeed:
 
     def __init__(self, store: Store, layer: str, prefix: str) -> None:
         self._store, self._layer, self._prefix = store, layer, prefix
-        self._known: dict[object, bytes] = {}
+        self._known: dict[TileId, bytes] = {}
         self._looked_s = time.monotonic()
 
     def all(self) -> list[Tile]:
@@ -85,7 +86,7 @@ class FleetFeed:
         return self._waiting(_POLL_S)
 
     def _waiting(self, wait_s: float) -> list[Tile]:
-        found = {}
+        found: dict[TileId, Tile] = {}
         while (update := self._stream.next(timeout_s=0.0 if found else wait_s)) is not None:
             if isinstance(update.tile, Tile):
                 found[update.tile.tile_id] = update.tile
