@@ -217,6 +217,11 @@ def write_cells(
     return ChangedCells(len(missing), len(gone))
 
 
+def place_of(name: str) -> str:
+    """What a cell's name says of its place, without its content; of other names a part."""
+    return name.rpartition("_")[0]
+
+
 def read_cell(path: Path) -> F32:
     """(N, 3) the points of a cell's file; ExportError: it cannot be read, or is not what was written."""
     try:

@@ -84,7 +84,7 @@ class MapService:
             request = read_request(service, cdr)
         except BadRosMessage as error:
             raise Refused(str(error)) from error
-        found, partial = self._found(request), service is partial_service()
+        found, partial = self._found(request), service == partial_service()
         if found.left:
             rest = "ask for a smaller area" if partial else "the next request gets them"
             _log.warning("%d cells more than %d bytes can hold: %s", found.left, self._limit_bytes, rest)

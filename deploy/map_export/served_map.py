@@ -13,6 +13,7 @@ from gnd.deploy.map_export.autoware import (
     CloudCell,
     cells_of,
     corners_of,
+    place_of,
     projection_of,
     read_cell,
     write_cells,
@@ -34,7 +35,7 @@ class CellsToLoad:
 
     Attributes:
         new: cells of the area that it has not, by id, the nearest to the centre first.
-        ids_to_remove: what it has and is not in the area, or no longer in the map.
+        ids_to_remove: what it has and is not in the area, or no longer in the map and whose place is not among `left`.
         left: how many cells more would not have fitted into the answer: the farthest.
     """
 
@@ -121,7 +122,9 @@ class ServedMap:
                 if size_bytes > limit_bytes:
                     break
                 new[name] = cell
-        return CellsToLoad(new, tuple(sorted(cached.difference(inside))), len(wanted) - len(new))
+        left = {place_of(name) for name in wanted[len(new) :]}  # there the client keeps what it has until then
+        gone = tuple(sorted(name for name in cached.difference(inside) if place_of(name) not in left))
+        return CellsToLoad(new, gone, len(wanted) - len(new))
 
     def _cell(self, name: str) -> CloudCell:
         corner = self._corners[name]

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -237,6 +237,31 @@ def test_what_does_not_fit_comes_with_the_next_request_the_nearest_first(
         off_m = [np.hypot(*(np.clip((5.0, 5.0), corners[n], np.add(corners[n], 20)) - (5.0, 5.0))) for n in came]
         assert off_m == sorted(off_m)
         assert "the next request gets them" in caplog.text
+
+
+def test_an_update_that_does_not_fit_leaves_no_hole(fleet: Fleet, client: AutowareClient, tmp_path: Path) -> None:
+    """The old cell goes when the new one comes, not before."""
+
+    def places() -> set[str]:
+        return {name.rpartition("_")[0] for name in client.held}
+
+    out = tmp_path / "autoware"
+    with serving(fleet, out, limit_bytes=25_000):
+        client.wait_served()
+        while client.update(5.0, 5.0, FAR).new:
+            pass
+        whole = places()
+        assert len(whole) == len(client.held)
+        shifted = some_tile(1).gaussians
+        fleet.publish(Tile(TILE, 2, replace(shifted, mean_m=shifted.mean_m * np.float32(0.5))))
+        wait_until(lambda: set(read_metadata(out)) != client.held.keys(), "the update")
+        rounds = 0
+        while client.update(5.0, 5.0, FAR).new:
+            rounds += 1
+            assert places() == whole
+            assert len(client.held) == len(whole)
+        assert rounds > 1
+        assert client.held.keys() == set(read_metadata(out))
 
 
 def test_several_clients_at_once_each_get_their_own_answers(fleet: Fleet, tmp_path: Path) -> None:
