@@ -1,130 +1,28 @@
-"""A localiser that knows the map from the service alone finds the pose that it finds on the whole export."""
+"""A localiser that knows the map from the service alone finds the pose that it finds on the whole export.
 
-import time
+On a real street: test_autoware_export.py, which has the map at hand.
+"""
+
 from pathlib import Path
 
-import numpy as np
 import pytest
-from autoware_client import AutowareClient
-from export_testing import Ndt, PlaneFrame, apart, beside, read_export, scans_of, vgicp
+from service_localising import check_drive
 
-from gnd.deploy.map_export.map_service import MapService
-from gnd.deploy.map_export.served_map import ServedMap
-from gnd.deploy.map_export.tile_feeds import open_feed
-from gnd.fleet_bus.bus import open_bus
-from gnd.fleet_bus.config import BusConfig
-from gnd.fleet_bus.ros2 import RosNode
-from gnd.fleet_bus.router import open_router
 from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from gnd.fleet_sim.insert_drive import rewrite_drive
 from gnd.fleet_sim.street import StreetOptions, street
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.importer import import_recording
-from gnd.vehicle_agent.importers.recording import NOMINAL
-
-RANGE_M = 25.0
-"""Points that are farther away are left out: of so short a map cells come and go all the same."""
-MARGIN_M = 5.0
-
-
-class OnCloud:
-    """VGICP, and NDT with Autoware's parameters, on a cloud."""
-
-    def __init__(self, cloud: np.ndarray) -> None:
-        self._vgicp = vgicp(cloud)
-        self._ndt = Ndt.of_moments(cloud, np.zeros((1, 3, 3)), np.ones(len(cloud)), 2.0, 6)
-
-    def align(self, points: np.ndarray, few: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """(2, 4, 4) the poses that they find."""
-        return np.stack([self._vgicp(points, start), self._ndt.align(few, start)])
-
-
-class OnService:
-    """A localiser that asks for the cells around it each time that it has gone so far, as Autoware's does."""
-
-    def __init__(self, client: AutowareClient, every_m: float) -> None:
-        self.client, self.every_m = client, every_m
-        self.requests = self.dropped = 0
-        self._asked_m = np.full(2, np.inf)
-
-    def here(self, x: float, y: float) -> OnCloud:
-        if not np.hypot(*(self._asked_m - (x, y))) < self.every_m:
-            began_s = time.monotonic()
-            answer = self.client.update(x, y, RANGE_M + self.every_m + MARGIN_M)
-            size_mb = sum(cell.points.nbytes for cell in answer.new.values()) / 1e6
-            print(f"{len(answer.new)} cells, {size_mb:.2f} MB, in {1e3 * (time.monotonic() - began_s):.0f} ms")
-            self._asked_m, self.requests = np.array((x, y)), self.requests + 1
-            self.dropped += len(answer.ids_to_remove)
-            self._on_held = OnCloud(np.concatenate(list(self.client.held.values())).astype(float))
-        return self._on_held
-
-
-def drive_along(folder: Path, drive: Path, every: int, localiser: OnService) -> np.ndarray:
-    """Poses of scans on what the service gives, on the whole export, on the first answer alone, and the reference.
-
-    (N, 4, 2, 4, 4): scans, the four maps, VGICP and NDT.
-    """
-    scans, rng, rows = list(scans_of(drive, every)), np.random.default_rng(1), []
-    projection, whole = read_export(folder)
-    plane, on_whole, on_first = PlaneFrame(scans[0][2], projection), OnCloud(whole), None
-    for scan, T, _ in scans:
-        points = scan[np.linalg.norm(scan, axis=1) < RANGE_M]
-        start, few = plane.pose(beside(T, rng)), points[rng.permutation(len(points))[:3000]]
-        on_held = localiser.here(float(start[0, 3]), float(start[1, 3]))
-        on_first = on_first or on_held
-        found = [on_map.align(points, few, start) for on_map in (on_held, on_whole, on_first)]
-        rows.append([*found, np.stack([plane.pose(T)] * 2)])
-    return np.stack(rows)
-
-
-def check_drive(folder: Path, drive: Path, every: int, every_m: float, endpoint: str) -> tuple[int, float]:
-    """How many cells were dropped on the way, and how far off, m, the first answer alone would have been at its end."""
-    with open_feed(str(folder / "base.sqlite"), "ndt", "") as feed, AutowareClient(endpoint) as client:
-        served = ServedMap(folder / "autoware", feed.all(), None, "samples")
-        with RosNode(open_bus(BusConfig(connect=(endpoint,))), 0, "gnd_map") as node:
-            MapService(node, served)
-            client.wait_served()
-            localiser = OnService(client, every_m)
-            held, whole, first, true = np.moveaxis(drive_along(folder / "autoware", drive, every, localiser), 1, 0)
-    assert localiser.requests >= 2
-    print(f"{len(held)} scans, {localiser.requests} requests, {localiser.dropped} cells dropped")
-    for i, name in enumerate(("VGICP", "NDT")):
-        off_m = np.linalg.norm(apart(held[:, i], whole[:, i]), axis=1).max()
-        error_m = np.median(np.linalg.norm(apart(held[:, i], true[:, i])[:, :2], axis=1))
-        print(f"{name}: off the whole export at most {1e3 * off_m:.2f} mm, off the reference {1e3 * error_m:.1f} mm")
-        assert off_m < 0.005  # the issue asks for 2 cm
-        assert error_m < 0.1
-    return localiser.dropped, float(np.linalg.norm(apart(first[-1:, 1], whole[-1:, 1])))
-
-
-@pytest.fixture
-def endpoint(free_port: int):
-    with open_router((f"tcp/127.0.0.1:{free_port}",)):
-        yield f"tcp/127.0.0.1:{free_port}"
 
 
 @pytest.mark.slow
-def test_a_localiser_drives_on_what_the_service_gives(tmp_path: Path, endpoint: str) -> None:
+def test_a_localiser_drives_on_what_the_service_gives(tmp_path: Path, free_port: int) -> None:
     world = street(1005, StreetOptions(length_m=100.0))
     mapping = DriveConfig("mapper", "HDL-32E", "before", errors=PERFECT, car_share=0.0, cruise_mps=10.0, scans=30)
     with SqliteStore(tmp_path / "base.sqlite") as opened:
         build_map([simulate_drive(world, mapping, tmp_path / "mapping.mcap")], opened)
     config = DriveConfig("car", "HDL-32E", "before", seed=3, scans=60, car_share=0.0, cruise_mps=10.0)
     drive = simulate_drive(world, config, tmp_path / "drive.mcap")
-    dropped, on_first_m = check_drive(tmp_path, drive, 6, 10.0, endpoint)
+    dropped, on_first_m = check_drive(tmp_path, drive, 6, 10.0, free_port)
     assert dropped > 0
     print(f"on the first answer alone: {1e3 * on_first_m:.1f} mm")
     assert on_first_m > 0.005  # the comparison sees cells that are missing
-
-
-@pytest.mark.slow
-def test_a_localiser_drives_on_what_the_service_gives_on_a_real_street(
-    shared_data: Path, tmp_path: Path, endpoint: str
-) -> None:
-    import_recording("kitti", shared_data / "kitti00_start16", tmp_path / "whole.mcap", anchor=NOMINAL)
-    rewrite_drive(tmp_path / "whole.mcap", tmp_path / "mapped.mcap", [], slice(0, None, 2))
-    rewrite_drive(tmp_path / "whole.mcap", tmp_path / "driven.mcap", [], slice(1, None, 2))
-    with SqliteStore(tmp_path / "base.sqlite") as opened:
-        build_map([tmp_path / "mapped.mcap"], opened)
-    check_drive(tmp_path, tmp_path / "driven.mcap", 3, 2.0, endpoint)
