@@ -53,6 +53,8 @@ def test_a_bare_ip_capture_and_a_folder_are_read_alike(tmp_path):
     again = open_recording("auto", tmp_path, ANCHOR)
     assert len(recording) == len(again) == 4
     np.testing.assert_array_equal(recording.read(2).points_m, again.read(2).points_m)
+    with pytest.raises(ImportDriveError, match=r"a\.pcap: a capture of link type 105; known are 1"):
+        opened(tmp_path, capture_packets(), link=105)
     shutil.copy(tmp_path / "a.pcap", tmp_path / "b.pcap")
     with pytest.raises(ImportDriveError, match=r"2 captures \(a\.pcap, b\.pcap\): name one"):
         open_recording("auto", tmp_path, ANCHOR)

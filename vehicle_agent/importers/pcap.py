@@ -7,6 +7,7 @@ other sensors are refused with what to do.
 """
 
 import weakref
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, Final
@@ -62,7 +63,12 @@ def open_pcap(path: Path, anchor: RecordingAnchor | None, choices: Choices | Non
         raise ImportDriveError(
             f"{path}: no packets of a Velodyne ({VELODYNE_BYTES} bytes) or an Ouster but {held}. {_ADVICE}"
         )
-    store = _Turns(path, strict=choices is not None and choices.strict)
+    return _open_velodyne(path, sizes, anchor, strict=choices is not None and choices.strict)
+
+
+def _open_velodyne(path: Path, sizes: Mapping[int, int], anchor: RecordingAnchor | None, *, strict: bool) -> Recording:
+    """The turns of a Velodyne; `sizes`: packets of each length."""
+    store = _Turns(path, strict=strict)
     t_ns = np.array([begin for begin, _, _ in store.index], np.int64)
     cut_off = (f"{store.left_out} turns cut off by the capture: left out",) if store.left_out else ()
     others = tuple(

@@ -77,13 +77,30 @@ class UdpCapture:
                 reader = reader_of(stream)
                 link = int(reader.datalink())
                 for stamp_s, frame in reader:
-                    found = self._udp(_ip_packet(link, frame))
+                    found = self._udp(self._ip_packet(link, frame))
                     if found is not None:
                         yield UdpPacket(round(stamp_s * 1_000_000_000), *found)
             except (ValueError, struct.error, damage) as error:
                 self.damaged = " ".join(str(error).split())[:200] or type(error).__name__
         self.incomplete += len(self._pending)
         self._pending.clear()
+
+    def _ip_packet(self, link: int, frame: bytes) -> bytes:
+        """The frame without the header of its link; empty where the link carries something else than IP.
+
+        Raises:
+            ImportDriveError: a link of another type.
+        """
+        if link in _PLAIN_LINKS:
+            return frame[_PLAIN_LINKS[link] :]
+        if link != 1:
+            raise ImportDriveError(
+                f"{self.path}: a capture of link type {link}; known are 1 (Ethernet), {sorted(_PLAIN_LINKS)}"
+            )
+        at = 12
+        while int.from_bytes(frame[at : at + 2], "big") in _VLAN:
+            at += 4
+        return frame[at + 2 :] if frame[at : at + 2] in (b"\x08\x00", b"\x86\xdd") else b""
 
     def _udp(self, packet: bytes) -> tuple[str, int, bytes] | None:
         """Source, port it goes to, payload; None where it is no UDP or not yet whole."""
@@ -125,19 +142,3 @@ class UdpCapture:
     def _give_up(self, key: tuple[bytes, int]) -> None:
         del self._pending[key]
         self.incomplete += 1
-
-
-def _ip_packet(link: int, frame: bytes) -> bytes:
-    """The frame without the header of its link; empty where the link carries something else than IP.
-
-    Raises:
-        ImportDriveError: a link of another type.
-    """
-    if link in _PLAIN_LINKS:
-        return frame[_PLAIN_LINKS[link] :]
-    if link != 1:
-        raise ImportDriveError(f"a capture of link type {link}; known are 1 (Ethernet), {sorted(_PLAIN_LINKS)}")
-    at = 12
-    while int.from_bytes(frame[at : at + 2], "big") in _VLAN:
-        at += 4
-    return frame[at + 2 :] if frame[at : at + 2] in (b"\x08\x00", b"\x86\xdd") else b""
