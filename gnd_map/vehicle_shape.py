@@ -18,7 +18,7 @@ from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.jit import kernel
 
 Mask = NDArray[np.bool_]
-Shape = Literal["none", "piece", "vehicle"]
+Shape = Literal["none", "side", "vehicle"]
 
 GROUND_REACH_M: Final = 2.5
 GROUND_BELOW_M: Final = 3.5
@@ -42,11 +42,11 @@ ROW_RUN_M: Final = 2.5
 """In a row that is longer than one car the longest stretch without a gap is at least so long."""
 MOST_CONTACT: Final = 0.35
 """What touches a higher thing with more of its voxels is a part of that."""
-PIECE_M: Final = (0.55, 0.8)
-"""Least width and length of a piece of a car of which little was seen."""
+SIDE_M: Final = (0.55, 2.2)
+"""Least width and length of what was seen of a car from one side."""
 BELOW_GROUND_M: Final = -0.3
 RAISED_M: Final = 0.05
-"""A piece of a car, of which little was seen, begins above the ground: below its sills the road is seen."""
+"""The side of a car begins above the ground: below its sills the road is seen."""
 
 
 def has_vehicle_shape(grid: VoxelGrid, before: Gaussians, new: Gaussians) -> Mask:
@@ -111,8 +111,8 @@ def _shape(low: F64, top: F64, at: F64, cov: F64, *, in_row: bool = True) -> Sha
     is_row = in_row and length > LENGTH_M[1] and ROW_RUN_M <= run <= LENGTH_M[1]
     if WIDTH_M[0] <= width <= WIDTH_M[1] and (is_one or is_row):
         return "vehicle"
-    is_piece = bottom > RAISED_M and PIECE_M[0] <= width <= WIDTH_M[1] and PIECE_M[1] <= length <= LENGTH_M[1]
-    return "piece" if is_piece else "none"
+    is_side = bottom > RAISED_M and SIDE_M[0] <= width <= WIDTH_M[1] and SIDE_M[1] <= length <= LENGTH_M[1]
+    return "side" if is_side else "none"
 
 
 def _footprint_m(at: F64, cov: F64) -> tuple[float, float, float]:

@@ -56,6 +56,7 @@ THINGS = {
     "a pole": box(*MIDDLE, 0.2, 0.2, GROUND_M, GROUND_M + 6.0),
     "a bollard": box(*MIDDLE, 0.2, 0.2, GROUND_M, GROUND_M + 1.0),
     "a balcony": box(*MIDDLE, 4.0, 1.5, GROUND_M + 3.0, GROUND_M + 4.2),
+    "a cabinet": box(*MIDDLE, 1.8, 1.2, GROUND_M, GROUND_M + 2.0, 0.4),
     "a kerb": box(*MIDDLE, 9.0, 2.0, GROUND_M, GROUND_M + 0.6),
     "a field of rubble": box(*MIDDLE, 11.0, 10.0, GROUND_M, GROUND_M + 1.5),
 }
