@@ -26,10 +26,12 @@ class MadeUp:
     Attributes:
         boxes: where they stand.
         voxels: of each box, those that the drives measured on it.
+        asked: how many boxes were asked for; there may be fewer bare places.
     """
 
     boxes: MadeUpBoxes
     voxels: tuple[Voxels, ...]
+    asked: int
 
 
 def with_made_up_boxes(drives: Sequence[Path], n: int, folder: Path) -> tuple[tuple[Path, ...], MadeUp]:
@@ -48,7 +50,7 @@ def with_made_up_boxes(drives: Sequence[Path], n: int, folder: Path) -> tuple[tu
     voxels: list[Voxels] = [{} for _ in boxes.blocks]
     for drive, copy in copies.items():
         voxels = together(voxels, write_with_boxes(drive, copy, boxes))
-    return tuple(copies[drive] for drive in drives), MadeUp(boxes, tuple(voxels))
+    return tuple(copies[drive] for drive in drives), MadeUp(boxes, tuple(voxels), n)
 
 
 def score_made_up(made_up: MadeUp | None, histories: Sequence[TileHistory]) -> dict[str, Any] | None:
@@ -59,6 +61,7 @@ def score_made_up(made_up: MadeUp | None, histories: Sequence[TileHistory]) -> d
     after = {history.tile.tile: history.after for history in histories}
     found = [_found(one, before, after) for one in made_up.voxels]
     return {
+        "asked": made_up.asked,
         "boxes": len(found),
         "boxes_in_map": sum(n > IN_MAP_SHARE * of for n, of in found),
         "voxels": sum(of for _, of in found),
@@ -90,7 +93,8 @@ def made_up_lines(score: dict[str, Any] | None) -> list[str]:
     """The score for people."""
     if score is None:
         return []
+    fewer = f" ({score['asked']} were asked for, no more bare places)" if score["boxes"] < score["asked"] else ""
     return [
-        f"made-up boxes: {score['boxes_in_map']} of {score['boxes']} are in the map now, {score['voxels_in_map']} of"
+        f"made-up boxes: {score['boxes_in_map']} of {score['boxes']}{fewer} are in the map now, {score['voxels_in_map']} of"
         f" their {score['voxels']} voxels; voxels changed elsewhere: {score['changes_elsewhere']}"
     ]

@@ -7,7 +7,7 @@ from typing import Any, Final
 from gnd.deploy.run_folder import RunFolder
 from gnd.schemas.drive_mcap import GNSS_TOPIC, MOTION_TOPIC, topics_of
 
-BOXES: Final = 6
+BOXES: Final = 4
 
 
 def after_map_build(drives: Sequence[Path], store: Path) -> list[str]:

@@ -33,12 +33,14 @@ SUNK_M: Final = 0.1
 NEAREST_M, FARTHEST_M = 2.8, 9.0
 """Between the middle of a box and the vehicle's way."""
 APART_M: Final = 5.0
-BORDER_M: Final = 12.0
+BORDER_M: Final = 10.0
 """Along the way: nearer to its ends a place is seen by too few scans."""
 CELL_M: Final = 0.5
-CLEAR_M: Final = 0.5
+CLEAR_M: Final = 0.4
 """Around a box: as bare as the place itself."""
 OVER_GROUND_M, UNEVEN_M = 0.35, 0.5
+BARE_SHARE: Final = 0.05
+"""Of the points of a cell that may lie over its ground: single ones do, and those of a vehicle that drove past."""
 REACH_M: Final = 30.0
 EVERY: Final = 2
 """Which scans are looked at for bare ground."""
@@ -116,15 +118,17 @@ class _Ground:
     def __init__(self, points_m: F64, level_m: F64) -> None:
         """Points (N, 3) in the map frame, and the height (N,) of the road of the pose that they were seen from."""
         low = np.abs(points_m[:, 2] - level_m) < TALL_M + 1.0
-        self._points_m = points_m[low]
-        cells = np.floor(self._points_m[:, :2] / CELL_M).astype(np.int64)
+        points_m = points_m[low]
+        cells = np.floor(points_m[:, :2] / CELL_M).astype(np.int64)
         self._first = cells.min(axis=0) if len(cells) else np.zeros(2, np.int64)
         shape = (cells - self._first).max(axis=0) + 1 if len(cells) else np.ones(2, np.int64)
         self._lowest_m = np.full(shape, np.inf)
         at = tuple((cells - self._first).T)
-        np.minimum.at(self._lowest_m, at, self._points_m[:, 2])
-        self._highest_m = np.full(shape, -np.inf)
-        np.maximum.at(self._highest_m, at, self._points_m[:, 2])
+        np.minimum.at(self._lowest_m, at, points_m[:, 2])
+        seen, over = np.zeros(shape), np.zeros(shape)
+        np.add.at(seen, at, 1.0)
+        np.add.at(over, at, points_m[:, 2] > self._lowest_m[at] + OVER_GROUND_M)
+        self._is_bare = over <= BARE_SHARE * seen
 
     @classmethod
     def seen(cls, drive: Path, track: Trajectory, T_vehicle_lidar: F64) -> "_Ground":
@@ -152,10 +156,10 @@ class _Ground:
         at = np.floor(places_m / CELL_M).astype(np.int64) - self._first
         if (at < 0).any() or (at >= self._lowest_m.shape).any():
             return None
-        lowest_m, highest_m = self._lowest_m[tuple(at.T)], self._highest_m[tuple(at.T)]
+        lowest_m = self._lowest_m[tuple(at.T)]
         if not np.isfinite(lowest_m).all() or np.ptp(lowest_m) > UNEVEN_M:
             return None
-        return float(np.median(lowest_m)) if (highest_m - lowest_m).max() < OVER_GROUND_M else None
+        return float(np.median(lowest_m)) if self._is_bare[tuple(at.T)].all() else None
 
 
 def write_with_boxes(source: Path, target: Path, boxes: MadeUpBoxes) -> list[Voxels]:

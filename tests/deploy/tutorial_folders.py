@@ -2,15 +2,22 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
-from gnd.vehicle_agent.importer import open_recording
+from gnd.deploy.next_commands import BOXES
+from gnd.deploy.play import messages_of
+from gnd.fleet_sim.made_up import bare_places, write_with_boxes
+from gnd.vehicle_agent.importer import import_recording, open_recording
 from gnd.vehicle_agent.importers.planes import KITTI_INS_HEIGHT_M
 
 SCANS = 40
 NAME = "2011_09_26_drive_0027_sync"
 ACCURACY_M = 0.1
+TYPES = get_typestore(Stores.ROS2_JAZZY)
 
 
 def kitti_folder(shared_data: Path, parent: Path) -> Path:
@@ -40,3 +47,24 @@ def kitti_folder(shared_data: Path, parent: Path) -> Path:
 def _stamp(t_ns: int) -> str:
     second, rest = divmod(t_ns, 1_000_000_000)
     return f"{datetime.fromtimestamp(second, UTC):%Y-%m-%d %H:%M:%S}.{rest:09d}"
+
+
+def bag_of(drive: Path, bag: Path) -> Path:
+    """A bag of ROS 2 (MCAP) with what the vehicle's drivers publish on this drive: /points, /gnss, /odometry, /tf_static."""
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for message in messages_of(drive):
+            name = message.topic.name
+            if name not in connections:
+                connections[name] = writer.add_connection(name, message.topic.type_name, typestore=TYPES)
+            writer.write(connections[name], message.sent_ns, message.payload)
+    return bag
+
+
+def bags_of_two_days(shared_data: Path, folder: Path) -> None:
+    """`monday` as KITTI recorded it, and `tuesday`: the same with made-up boxes in its scans."""
+    drive, changed = folder / "drive.mcap", folder / "changed.mcap"
+    import_recording("auto", kitti_folder(shared_data, folder), drive)
+    write_with_boxes(drive, changed, bare_places(drive, BOXES))
+    bag_of(drive, folder / "monday")
+    bag_of(changed, folder / "tuesday")
