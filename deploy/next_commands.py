@@ -8,18 +8,21 @@ from gnd.deploy.run_folder import RunFolder
 from gnd.schemas.drive_mcap import GNSS_TOPIC, MOTION_TOPIC, topics_of
 
 BOXES: Final = 4
+RUN: Final = "healed"
 
 
 def after_map_build(drives: Sequence[Path], store: Path) -> list[str]:
     """With a recording of another day, and with this one alone."""
     alone = next((drive for drive in drives if {GNSS_TOPIC, MOTION_TOPIC} <= set(topics_of(drive))), None)
-    lines = [f"next: gnd fleet --drives LATER --map {store} (LATER: a recording of the same street on another day)"]
+    lines = [
+        f"next: gnd fleet --drives LATER --map {store} --out {RUN} (LATER: the same street, recorded on another day)"
+    ]
     if alone is None:
         return [*lines, "  (vehicles need fixes and speeds: a recording without them is imported with --stand-ins)"]
     return [
         *lines,
         f"  or, without another day: gnd fleet --drives {alone} --agents 2 --map {store} --made-up {BOXES}"
-        " (two vehicles meet made-up boxes)",
+        f" --out {RUN} (two vehicles meet made-up boxes)",
     ]
 
 
@@ -28,6 +31,6 @@ def after_fleet(summary: dict[str, Any], base_map: Path, folder: RunFolder) -> l
     if not summary["tiles_published"]:
         return [f"next: gnd map status {folder.store} (nothing was published)"]
     return [
-        f"next: gnd map diff {base_map} {folder.store} --to changes.gpkg (a row an object, for a GIS);"
-        f" gnd view {folder.root} (Rerun); picture: {folder.root / 'map_after.png'}",
+        f"next: gnd map diff {base_map} {folder.store} --to changes.gpkg (a row for each changed object, for a GIS)",
+        f"  or: gnd view {folder.root} (the map and its changes in Rerun); picture: {folder.root / 'map_after.png'}",
     ]

@@ -14,7 +14,7 @@ from gnd.fleet_sim.made_up import bare_places, write_with_boxes
 from gnd.vehicle_agent.importer import import_recording, open_recording
 from gnd.vehicle_agent.importers.planes import KITTI_INS_HEIGHT_M
 
-SCANS = 40
+SCANS = 32
 NAME = "2011_09_26_drive_0027_sync"
 ACCURACY_M = 0.1
 TYPES = get_typestore(Stores.ROS2_JAZZY)
