@@ -88,7 +88,9 @@ def run_options(command: _Command) -> _Command:
 @click.option("--agents", type=int, help="Vehicle agent processes.  [default: 8, or one a drive with --drives]")
 @click.option("--link", help="Link of every vehicle: 3g, 4g, 5g, none, or a TOML file.  [default: 4g]")
 @click.option("--port", type=int, help="Port of the router; 0 takes a free one.  [default: 0]")
-@click.option("--made-up", type=click.IntRange(min=0), default=0, help="Made-up boxes to put into the scans of --drives.")
+@click.option(
+    "--made-up", type=click.IntRange(min=0), default=0, help="Made-up boxes to put into the scans of --drives."
+)
 @run_options
 def fleet(
     drives: tuple[Path, ...],

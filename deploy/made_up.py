@@ -93,8 +93,9 @@ def made_up_lines(score: dict[str, Any] | None) -> list[str]:
     """The score for people."""
     if score is None:
         return []
-    fewer = f" ({score['asked']} were asked for, no more bare places)" if score["boxes"] < score["asked"] else ""
+    boxes, asked = score["boxes"], score["asked"]
+    fewer = f" ({asked} were asked for, no more bare places)" if boxes < asked else ""
     return [
-        f"made-up boxes: {score['boxes_in_map']} of {score['boxes']}{fewer} are in the map now, {score['voxels_in_map']} of"
+        f"made-up boxes: {score['boxes_in_map']} of {boxes}{fewer} are in the map now, {score['voxels_in_map']} of"
         f" their {score['voxels']} voxels; voxels changed elsewhere: {score['changes_elsewhere']}"
     ]

@@ -140,8 +140,8 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         summary["waiting_for_confirmation"],
     )
     lines = [
-        f"{summary['agents']} agent{'s' if summary['agents'] != 1 else ''} drove {summary['drive_km']:.2f} km on {summary['link']} links "
-        f"in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
+        f"{summary['agents']} agent{'' if summary['agents'] == 1 else 's'} drove {summary['drive_km']:.2f} km"
+        f" on {summary['link']} links in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
         f"{summary['reports_sent']} reports sent, {summary['reports_acknowledged']} acknowledged, "
         f"{summary['reports_lost']} lost; {summary['tiles_published']} tile versions published, "
         f"{summary['updates_received']} updates received, {summary['changed_voxels']} voxels changed",
@@ -149,8 +149,8 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     ]
     if waiting["voxels"]:
         lines.append(
-            f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles: another vehicle that finds the"
-            " same confirms it (`gnd map status`)"
+            f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles: another vehicle that"
+            " finds the same confirms it (`gnd map status`)"
         )
     lines += [one["says"] for one in summary["named_vehicles"]]
     if p95["longitudinal_m"] is not None:

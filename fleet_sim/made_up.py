@@ -83,9 +83,7 @@ def bare_places(drive: Path, n: int, seed: int = 0) -> MadeUpBoxes:
     header, reference = read_header(drive), load_track(drive)[2]
     way_m = np.r_[0.0, np.linalg.norm(np.diff(reference.T_map_vehicle[:, :3, 3], axis=0), axis=1).cumsum()]
     if len(reference.t_ns) < 2 or way_m[-1] <= 2 * BORDER_M:
-        raise SimError(
-            f"{drive}: {way_m[-1] if len(way_m) else 0.0:.0f} m with reference poses; made-up boxes need {2 * BORDER_M:.0f} m"
-        )
+        raise SimError(f"{drive}: {way_m[-1]:.0f} m with reference poses; made-up boxes need {2 * BORDER_M:.0f} m")
     ground = _Ground.seen(drive, Trajectory(reference.t_ns, reference.T_map_vehicle), header.T_vehicle_lidar)
     inner = reference.T_map_vehicle[(way_m > BORDER_M) & (way_m < way_m[-1] - BORDER_M)]
     rng, blocks = np.random.default_rng(seed), list[Block]()

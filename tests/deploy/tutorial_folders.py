@@ -50,7 +50,7 @@ def _stamp(t_ns: int) -> str:
 
 
 def bag_of(drive: Path, bag: Path) -> Path:
-    """A bag of ROS 2 (MCAP) with what the vehicle's drivers publish on this drive: /points, /gnss, /odometry, /tf_static."""
+    """A bag of ROS 2 (MCAP) with what the vehicle's drivers publish: /points, /gnss, /odometry, /tf_static."""
     with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
         for message in messages_of(drive):
