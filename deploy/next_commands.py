@@ -28,6 +28,12 @@ def after_map_build(drives: Sequence[Path], store: Path) -> list[str]:
 
 def after_fleet(summary: dict[str, Any], base_map: Path, folder: RunFolder) -> list[str]:
     """What has changed, as a list, in pictures, and on."""
+    if not summary["drive_km"]:
+        return [
+            f"no vehicle found its place on {base_map}: is it a map of this street, and do the drives have fixes and"
+            " speeds (imported with --stand-ins where none were measured)?",
+            f"next: gnd map info {base_map}; gnd import auto DRIVE",
+        ]
     if not summary["tiles_published"]:
         return [f"next: gnd map status {folder.store} (nothing was published)"]
     return [

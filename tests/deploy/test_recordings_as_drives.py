@@ -91,10 +91,12 @@ def test_the_commands_after_a_map_are_named(tmp_path: Path) -> None:
 
 def test_the_commands_after_a_run_are_named(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
-    changed, _ = after_fleet({"tiles_published": 2}, Path("map.sqlite"), folder)
+    changed, _ = after_fleet({"tiles_published": 2, "drive_km": 0.1}, Path("map.sqlite"), folder)
     assert changed.startswith(f"next: gnd map diff map.sqlite {folder.store} --to changes.gpkg")
-    (nothing,) = after_fleet({"tiles_published": 0}, Path("map.sqlite"), folder)
+    (nothing,) = after_fleet({"tiles_published": 0, "drive_km": 0.1}, Path("map.sqlite"), folder)
     assert nothing.startswith(f"next: gnd map status {folder.store}")
+    lost, _ = after_fleet({"tiles_published": 0, "drive_km": 0.0}, Path("map.sqlite"), folder)
+    assert lost.startswith("no vehicle found its place on map.sqlite: ")
 
 
 def test_made_up_boxes_are_for_recordings() -> None:
