@@ -18,7 +18,7 @@ import pytest
 from console_pages import ShownCommand, check_printed, commands_of
 from tutorial_folders import NAME, SCANS, bags_of_two_days, kitti_folder
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(420)]  # on a busy machine
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIALS = ROOT / "docs" / "tutorials"
 PORT = 7447  # of the page
@@ -38,7 +38,7 @@ def ran(command: ShownCommand, cwd: Path, more: tuple[str, ...] = ()) -> str:
     """What a command of a page prints on standard output."""
     assert command.words[0] == "gnd"
     process = started([*command.words, *more], cwd)
-    out, err = process.communicate(timeout=150)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0, f"$ {command.line}\n{out}\n{err}"
     return out
 
@@ -120,7 +120,7 @@ def test_a_live_vehicle_heals_the_map_over_a_real_router(two_days: Path, tmp_pat
     with running(cloud, tmp_path, free_port) as processes:
         agent = started([*commands["agent"].words, *on_port(commands["agent"], free_port)], tmp_path)
         check_printed(commands["play"], ran(commands["play"], tmp_path, on_port(commands["play"], free_port)))
-        out, err = agent.communicate(timeout=150)
+        out, err = agent.communicate(timeout=300)
         assert agent.returncode == 0, err
         check_printed(commands["agent"], out, **FEW)
         result = json.loads((tmp_path / "runs" / "car-7" / "result.json").read_text())
