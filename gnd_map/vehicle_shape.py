@@ -38,7 +38,7 @@ WIDTH_M: Final = (1.3, 4.0)
 LENGTH_M: Final = (2.5, 9.0)
 GAP_M: Final = 0.1
 """Cars that stand in a row have gaps between them."""
-ROW_RUN_M: Final = 2.5
+ROW_RUN_M: Final = (2.0, 11.0)
 """In a row that is longer than one car the longest stretch without a gap is at least so long."""
 MOST_CONTACT: Final = 0.35
 """What touches a higher thing with more of its voxels is a part of that."""
@@ -108,7 +108,7 @@ def _shape(low: F64, top: F64, at: F64, cov: F64, *, in_row: bool = True) -> Sha
     if len(at) >= SEVERAL and roof - bottom < LEAST_HEIGHT_M:
         return "none"
     is_one = LENGTH_M[0] <= length <= LENGTH_M[1]
-    is_row = in_row and length > LENGTH_M[1] and ROW_RUN_M <= run <= LENGTH_M[1]
+    is_row = in_row and length > LENGTH_M[1] and ROW_RUN_M[0] <= run <= ROW_RUN_M[1]
     if WIDTH_M[0] <= width <= WIDTH_M[1] and (is_one or is_row):
         return "vehicle"
     is_side = bottom > RAISED_M and SIDE_M[0] <= width <= WIDTH_M[1] and SIDE_M[1] <= length <= LENGTH_M[1]
