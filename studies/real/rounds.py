@@ -340,14 +340,15 @@ def _again(scene: RecordedScene, drive: Drive, mapping: Iterable[Scan], method: 
 def looked_at(mapping: FoundVoxels) -> I64:
     """Keys of the voxels that the map's half had looked at, by its rays alone.
 
-    One that holds a Gaussian, of the map or found new by the drive: `MIN_BEAMS` rays of the map's half ended in it or
-    passed through this very surface. Rays that only crossed another part of the voxel do not tell whether there was
-    something: over a road, most pass above the ground. One that holds none: the map's half, too, calls it empty.
+    One that holds a Gaussian, of the map or found new by the drive: as many rays of the map's half ended in it or
+    passed through this very surface as a Gaussian needs sub-cells; with fewer the map cannot hold it. Rays that only
+    crossed another part of the voxel do not tell whether there was something: over a road, most pass above the ground.
+    One that holds none: the map's half, too, calls it empty.
 
     Args:
         mapping: what the mapping scans say of the map with the drive's new voxels in it.
     """
-    met = mapping.in_map & (mapping.hits + mapping.passes >= MIN_BEAMS)
+    met = mapping.in_map & (mapping.hits + mapping.passes >= N_MIN_CELLS)
     return np.sort(mapping.keys[met | mapping.where(ChangeClass.EMPTY)])
 
 
