@@ -141,8 +141,8 @@ def detect(
         raise RealDataError(f"{scene.name}: the localiser found no good pose for any scan on the map of the other half")
     evidence = detector.finish(detector.touched_tiles())
     classified = {tile: classify(e, parameters) for tile, e in evidence.items()}
-    held = {tile: one for tile in local_map.tiles if (one := local_map.tile(tile)) is not None}
-    grown = {tile: one.gaussians for tile, one in held.items()} | {t: _grown(c) for t, c in classified.items()}
+    held = {tile.tile_id: tile.gaussians for t in local_map.tiles if (tile := local_map.tile(t)) is not None}
+    grown = held | {tile: _grown(one) for tile, one in classified.items()}
     return Drive(_found(scene, classified, used), grown)
 
 
