@@ -32,7 +32,7 @@ def gaussians(
         ((11, 11, 31), 0.0, FLAT, True),  # across the corner
         ((11, 10, 31), 0.4, FLAT, False),  # above the plane
         ((12, 10, 31), 0.0, FLAT, False),  # two voxels on
-        ((11, 10, 31), 0.05, ROUND, False),  # the neighbour is no plane, what was measured is
+        ((11, 10, 31), 0.05, ROUND, False),  # the neighbour is no plane
     ],
 )
 def test_what_continues_the_plane_next_door(
@@ -73,15 +73,6 @@ def test_a_plain_search_through_all_pairs_finds_the_same() -> None:
     ]
     assert extends_neighbour(Tile(TILE, 1, base), new).tolist() == expected
     assert 0 < sum(expected) < len(new)
-
-
-@pytest.mark.parametrize(("neighbours", "cov", "continues"), [(1, ROUND, False), (2, ROUND, True), (2, FLAT, False)])
-def test_what_is_rough_continues_a_bush_of_two_gaussians(
-    neighbours: int, cov: tuple[float, ...], continues: bool
-) -> None:
-    at = [(10, 10, 31), (10, 11, 31)][:neighbours]
-    base = Tile(TILE, 1, gaussians(at, [0.0] * neighbours, ROUND))
-    assert extends_neighbour(base, gaussians([(11, 10, 31)], [0.4], cov)).tolist() == [continues]
 
 
 @pytest.mark.parametrize(("K", "n"), [(25, 400), (40, 80), (100, 60), (300, 40)])

@@ -49,7 +49,7 @@ def classify(evidence: TileEvidence, parameters: DetectParameters) -> Classifica
     The state is the largest mass after Eq. (11); a voxel is new, modified or deleted when it is `changed`. `default`
     mode adds: a new Gaussian of the map's shape keeps the voxel normal, one of another shape makes even a sustained
     voxel modified (`shape_change`); deletion needs fewer hits than chance explains (`permeable`); a new Gaussian must
-    be more than what the map holds beside it, seen better (`extension`); too few hits, too few rays or a tie abstain.
+    be more than the edge of a known surface (`extension`); too few hits, too few rays or a tie abstain.
     """
     decide = _decide_paper if parameters.mode == "paper" else _decide_default
     return Classification(evidence, decide(evidence, parameters).astype(np.uint8))
@@ -103,7 +103,7 @@ def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 
 
 def _is_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
-    """(K,) whether half as many points would have shown a new Gaussian, too: clearer ones beside what the map holds."""
+    """(K,) whether half as many points would have shown a new Gaussian, too; at the edge of a known surface, more."""
     cells = cells_at_half(e.measured.cells, e.measured.count)
     new = ~e.in_map & (e.measured.cells >= MIN_CELLS) & (cells >= p.new_cells)
     rows = np.flatnonzero(new & (cells < p.new_cells_at_edge))

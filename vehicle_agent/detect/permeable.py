@@ -19,8 +19,8 @@ from gnd.vehicle_agent.detect.records import planar_normals
 OPACITY_OF_SURFACE: Final = 0.25
 """Of the rays through it, a planar Gaussian stops at least this share: 14 passes without a hit delete it, as Eq. (11)
 does with the default λcp."""
-OPACITY_OF_VOLUME: Final = 0.07
-"""The same of a Gaussian that is no plane: 54 passes without a hit delete it."""
+OPACITY_OF_VOLUME: Final = 0.10
+"""The same of a Gaussian that is no plane: 38 passes without a hit delete it."""
 _CHANCE: Final = 0.02
 """So improbable the few hits must be."""
 
