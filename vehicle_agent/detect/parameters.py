@@ -83,7 +83,7 @@ class DetectParameters:
     new_cells: int = setting(
         18,
         "Occupied 10 cm sub-cells that make a Gaussian where the map has none, as many as half of the points would"
-        " fill; 1.75 times as many at the edge of a known surface: noise and the error of poses thicken it.",
+        " fill; twice as many at the edge of a known surface: noise and the error of poses thicken it.",
         least=10,
         most=1000,
     )
@@ -103,7 +103,7 @@ class DetectParameters:
     @property
     def new_cells_at_edge(self) -> int:
         """`new_cells` at the edge of a known surface: within 15 cm of the plane of a planar Gaussian next door."""
-        return self.new_cells * 7 // 4
+        return self.new_cells * 2
 
     def excess_m2(self, pose: PoseUncertainty) -> float:
         """Variance of points at the pose's range beyond what `block_noise_m` and the others stand for."""
