@@ -115,7 +115,7 @@ def refined_scans(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drive:
+class DriveFindings:
     """What a drive found: voxel by voxel, and the map that it would be after it."""
 
     found: FoundVoxels
@@ -125,7 +125,7 @@ class Drive:
 
 def detect(
     scene: RecordedScene, local_map: LocalMap, scans: Iterable[SegmentedScan], parameters: DetectParameters
-) -> Drive:
+) -> DriveFindings:
     """Classes of all voxels that the scans touched.
 
     Raises:
@@ -143,7 +143,7 @@ def detect(
     classified = {tile: classify(e, parameters) for tile, e in evidence.items()}
     held = {tile.tile_id: tile.gaussians for t in local_map.tiles if (tile := local_map.tile(t)) is not None}
     grown = held | {tile: _grown(one) for tile, one in classified.items()}
-    return Drive(_found(scene, classified, used), grown)
+    return DriveFindings(_found(scene, classified, used), grown)
 
 
 def _grown(one: Classification) -> Gaussians:

@@ -21,7 +21,7 @@ from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
-from studies.real.drive import Drive, FoundVoxels, Poses, Tiles, detect, local_map_of, refined_scans, segmented
+from studies.real.drive import DriveFindings, FoundVoxels, Poses, Tiles, detect, local_map_of, refined_scans, segmented
 from studies.real.scene import Cells, RecordedScans, RecordedScene, in_range, place
 
 F64 = NDArray[np.float64]
@@ -331,7 +331,7 @@ def _untouched(scene: RecordedScene, mapping: list[Scan], driving: list[Scan], m
     return Untouched(drive.found, tiles, again, looked_at(again), Cells.of(points), driven, moving, from_m)
 
 
-def _again(scene: RecordedScene, drive: Drive, mapping: Iterable[Scan], method: Method) -> FoundVoxels:
+def _again(scene: RecordedScene, drive: DriveFindings, mapping: Iterable[Scan], method: Method) -> FoundVoxels:
     """What the mapping scans say of the map with what the drive found new in it."""
     scans = segmented(map(scene.refined, mapping), method.segment)
     return detect(scene, local_map_of(scene, drive.grown), scans, method.detect).found

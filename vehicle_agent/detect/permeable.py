@@ -1,6 +1,6 @@
 """Whether a Gaussian of the map is gone, or rays pass through it as they always did.
 
-Leaves, bushes, wire and the rims of things stop only a part of the rays that meet them: on real recordings four in five
+Leaves, bushes, wire and the rims of things stop only a part of the rays that meet them: on real recordings seven in ten
 false deletions were Gaussians that most rays of the mapping drive itself had passed. Far from the vehicle few rays meet
 such a Gaussian, and that all of them pass is chance, not change. So it is gone only where so few hits of so many rays
 are improbable for what stops the least that such a Gaussian may stop.
