@@ -64,7 +64,7 @@ class ConfirmationParameters:
         least=1,
     )
     parked_h: float = setting(
-        24.0,
+        18.0,
         "What is new and has the shape of a vehicle must have stood for so long, whoever saw it; each time that "
         "something has gone from there doubles it. 0: it is published as anything else.",
         unit="h",

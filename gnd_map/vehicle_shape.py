@@ -39,8 +39,8 @@ LENGTH_M: Final = (2.5, 9.0)
 GAP_M: Final = 0.1
 """Cars that stand in a row have gaps between them."""
 ROW_RUN_M: Final = (2.0, 11.0)
-"""In a row that is longer than one car the longest stretch without a gap is at least so long."""
-MOST_CONTACT: Final = 0.35
+"""The longest stretch without a gap of a row that is longer than one car."""
+MOST_CONTACT: Final = 0.5
 """What touches a higher thing with more of its voxels is a part of that."""
 SIDE_M: Final = (0.55, 2.2)
 """Least width and length of what was seen of a car from one side."""
@@ -76,10 +76,10 @@ def has_vehicle_shape(grid: VoxelGrid, before: Gaussians, new: Gaussians) -> Mas
         if _shape(low[mine], top[mine], place[mine, :2], cov[mine]) != "none":
             found[mine] = True
             continue
-        for part in groups_of(
-            index, mine[_is_low_column(index[mine], top[mine])]
-        ):  # a car beside something that is none
-            found[part] = _shape(low[part], top[part], place[part, :2], cov[part]) == "vehicle"
+        is_low = _is_low_column(index[mine], top[mine])
+        for part in groups_of(index, mine[is_low]):  # a car beside a higher thing
+            is_one = _shape(low[part], top[part], place[part, :2], cov[part]) == "vehicle"
+            found[part] = is_one and _touching(index[part], index[mine[~is_low]]) <= MOST_CONTACT * len(part)
     return found
 
 
@@ -91,11 +91,8 @@ def _is_low_column(index: I64, top: F64) -> Mask:
     return np.asarray(highest[column] <= TOP_M[1])
 
 
-def _shape(low: F64, top: F64, at: F64, cov: F64, *, in_row: bool = True) -> Shape:
-    """The shape of a group: its lower and upper ends over the ground (K,), places (K, 2), covariances (K, 6).
-
-    `in_row`: whether several vehicles in a row are one, too.
-    """
+def _shape(low: F64, top: F64, at: F64, cov: F64) -> Shape:
+    """The shape of a group: its lower and upper ends over the ground (K,), places (K, 2), covariances (K, 6)."""
     if np.isnan(low).mean() > 0.5:
         return "none"
     bottom, roof = float(np.nanmin(low)), float(np.nanmax(top))
@@ -108,7 +105,7 @@ def _shape(low: F64, top: F64, at: F64, cov: F64, *, in_row: bool = True) -> Sha
     if len(at) >= SEVERAL and roof - bottom < LEAST_HEIGHT_M:
         return "none"
     is_one = LENGTH_M[0] <= length <= LENGTH_M[1]
-    is_row = in_row and length > LENGTH_M[1] and ROW_RUN_M[0] <= run <= ROW_RUN_M[1]
+    is_row = length > LENGTH_M[1] and ROW_RUN_M[0] <= run <= ROW_RUN_M[1]
     if WIDTH_M[0] <= width <= WIDTH_M[1] and (is_one or is_row):
         return "vehicle"
     is_side = bottom > RAISED_M and SIDE_M[0] <= width <= WIDTH_M[1] and SIDE_M[1] <= length <= LENGTH_M[1]
