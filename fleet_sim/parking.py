@@ -1,0 +1,36 @@
+"""Where cars park: the voxels in which a parked car may be taken for a change of the map."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd.fleet_sim.cars import LANE_M
+from gnd.fleet_sim.truth import Truth
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile_id import TileId
+
+_HALF_M: Final = 1.6
+"""A car is about 1.9 m wide and stands up to 0.3 m off the middle of its lane; voxels reach 0.5 m farther."""
+_LOW_M: Final = 0.0
+_HIGH_M: Final = 3.0
+
+
+def on_parking(world: World, truth: Truth) -> NDArray[np.bool_]:
+    """Return which voxels of the truth, bool (V,), a car on a parking lane may reach."""
+    found = np.zeros(len(truth), dtype=np.bool_)
+    for morton in np.unique(truth.morton).tolist():
+        tile = TileId(int(morton))
+        low, high = np.searchsorted(truth.morton, [morton, morton + 1])
+        grid = GridFrame.around(truth.frame, [tile])
+        centre = world.street_of_map(grid.centre_map_m(grid.grid_of_voxel(tile, truth.voxel_id[low:high])))
+        found[low:high] = _on_parking(world, centre)
+    return found
+
+
+def _on_parking(world: World, centre_street: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether points (N, 3) of the street frame lie where a car on a parking lane may be."""
+    across, above = np.abs(centre_street[:, 1]), centre_street[:, 2]
+    lane = np.abs(across - (world.kerb_m - LANE_M)) <= _HALF_M
+    return np.asarray(lane & (above >= _LOW_M) & (above <= _HIGH_M))
