@@ -36,8 +36,8 @@ from gnd.gnd_map.grid import GridFrame, zones
 from gnd.gnd_map.tile_id import TileId
 
 Level = Literal["observable", "all", "scored"]
-"""*observable*: near enough, and visible after the changes, marginal ones too; it leads. *all*: every voxel that rays of
-the dense scan touched. *scored*: observable ones whose class no hair decides."""
+"""*observable*: near enough, and visible after the changes, marginal ones too; it leads. *all*: every voxel that a ray
+touched. *scored*: observable ones whose class no hair decides."""
 LEVELS: Final[tuple[Level, ...]] = get_args(Level)
 CHANGES: Final = (ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
 """The three classes of change."""
@@ -61,8 +61,7 @@ class TruthRules:
         reach_m: observable voxels lie within this distance of the road's middle (plus a lane).
         end_m: and at least so far inside the street's ends.
         low_m, high_m: and between these heights over the road.
-        visible_cells: sub-cells of an observable Gaussian that are visible after: as many as a Gaussian needs.
-        seen_cells: the same of a scored one.
+        seen_cells: sub-cells of an observable Gaussian that are visible after.
         passes: followed rays that pass after through an observable voxel without a Gaussian.
     """
 
@@ -76,7 +75,6 @@ class TruthRules:
     end_m: float = 5.0
     low_m: float = -1.0
     high_m: float = 8.0
-    visible_cells: int = N_MIN_CELLS
     seen_cells: int = 40
     passes: int = 30
 
@@ -92,7 +90,7 @@ class Truth:
         morton: int64 (V,), tile of each voxel.
         voxel_id: int32 (V,), voxel in its tile; sorted by (morton, voxel_id).
         change_class: uint8 (V,), a `ChangeClass` from NORMAL to EMPTY.
-        clear: bool (V,), not marginal, and well visible after if a Gaussian stands there.
+        clear: bool (V,), not marginal.
         observable: bool (V,), near enough and visible.
         before: Gaussians of the state before.
         after: Gaussians of what stands after.
@@ -159,8 +157,7 @@ def _truth_of_zone(world: World, scan: DenseScan, rules: TruthRules, plan: ScanP
     classes = classify(scan, rules)
     morton, voxel_id = scan.grid_frame.tile_voxel_of(scan.g.astype(np.int64))
     order = np.lexsort((voxel_id, morton))
-    clear = ~marginal(scan, rules) & well_seen(scan, classes, rules)
-    observable = observed(world, scan, classes, rules)
+    clear, observable = ~marginal(scan, rules), observed(world, scan, classes, rules)
     return Truth(
         world_sha=world_sha(world),
         plan=plan,
@@ -216,21 +213,9 @@ def observed(world: World, scan: DenseScan, classes: NDArray[np.uint8], rules: T
     near = np.abs(centre[:, 1]) <= rules.reach_m + world.lane_offset_m
     near &= np.abs(centre[:, 0]) <= world.half_length_m - rules.end_m
     near &= (centre[:, 2] >= rules.low_m) & (centre[:, 2] <= rules.high_m)
-    seen = _seen_after(scan) >= rules.visible_cells
-    return np.asarray(near & np.where(_nothing_stands(classes), scan.passes[:, 1] >= rules.passes, seen))
-
-
-def well_seen(scan: DenseScan, classes: NDArray[np.uint8], rules: TruthRules) -> BoolArray:
-    """Return which voxels, bool (V,), hold nothing after, or something of which enough is visible to be scored."""
-    return np.asarray(_nothing_stands(classes) | (_seen_after(scan) >= rules.seen_cells))
-
-
-def _nothing_stands(classes: NDArray[np.uint8]) -> BoolArray:
-    return np.asarray((classes == ChangeClass.DELETED) | (classes == ChangeClass.EMPTY))
-
-
-def _seen_after(scan: DenseScan) -> NDArray[np.int32]:
-    return scan.count(dense_scan.AFTER_KEPT | dense_scan.AFTER_COME)
+    seen = scan.count(dense_scan.AFTER_KEPT | dense_scan.AFTER_COME) >= rules.seen_cells
+    gone = (classes == ChangeClass.DELETED) | (classes == ChangeClass.EMPTY)
+    return np.asarray(near & np.where(gone, scan.passes[:, 1] >= rules.passes, seen))
 
 
 def _changed_share(scan: DenseScan) -> NDArray[np.float64]:

@@ -144,7 +144,6 @@ def test_the_rules_are_fixed() -> None:
         "end_m": 5.0,
         "low_m": -1.0,
         "high_m": 8.0,
-        "visible_cells": 20,
         "seen_cells": 40,
         "passes": 30,
     }
