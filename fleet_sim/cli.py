@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from gnd.fleet_sim.families.catalogue import FAMILIES
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import SITES, StreetOptions, street
 from gnd.fleet_sim.world import STATES, World, read_world, write_world
@@ -30,12 +31,14 @@ def world() -> None:
 @click.option("--site", type=click.Choice(SITES), default="border", show_default=True, help="Where the street lies.")
 @click.option("--lat", "lat_deg", type=float, help="Latitude of its middle in degrees, instead of a site.")
 @click.option("--lon", "lon_deg", type=float, help="Longitude of its middle in degrees, instead of a site.")
+@click.option("--family", type=click.Choice(list(FAMILIES)), default="street", show_default=True, help="Kind of place.")
+@click.option("--parking", type=float, help="Share of parking slots that are taken on its drives, 0 to 1.")
 @click.option("--edits", "edit_share", default=1.0, show_default=True, help="Share of the street's edits to make.")
 def write(file: Path, seed: int, **options: Any) -> None:
     """Write the street of a seed to FILE (JSON)."""
     made = street(seed, StreetOptions(**options))
     write_world(made, file)
-    click.echo(f"{file}: {len(made.objects)} objects, {options['length_m']:g} m, seed {seed}")
+    click.echo(f"{file}: {len(made.objects)} objects, {options['length_m']:g} m, {options['family']}, seed {seed}")
 
 
 @world.command("inspect")
@@ -94,7 +97,7 @@ def _note(made: World) -> str:
 @click.option("--reverse", is_flag=True, help="Drive against the street's x.")
 @click.option("--seed", default=0, show_default=True, help="Seed of everything random in the drive.")
 @click.option("--vehicle", default="vehicle-0", show_default=True, help="Pseudonym of the vehicle.")
-@click.option("--cars", default=0.2, show_default=True, help="Share of parking slots that are taken.")
+@click.option("--cars", type=float, help="Share of parking slots that are taken.  [default: the world's, usually 0.2]")
 @click.option("--traffic", type=click.Choice(["none", "urban"]), default="none", show_default=True, help="Movers.")
 @click.option("--scans", type=int, help="At most so many scans.")
 @click.option("--camera", is_flag=True, help="A camera that detects traffic signs, too.")
@@ -106,7 +109,7 @@ def drive(
     reverse: bool,
     seed: int,
     vehicle: str,
-    cars: float,
+    cars: float | None,
     traffic: str,
     scans: int | None,
     camera: bool,

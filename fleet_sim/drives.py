@@ -78,8 +78,8 @@ class DriveConfig:
         state: the world's state that it drives through.
         direction: +1 along the street, -1 against it.
         seed: everything random of this drive.
-        cruise_mps: speed once under way.
-        car_share: share of parking slots that are taken.
+        cruise_mps: speed once under way; None: as usual in the world.
+        car_share: share of parking slots and bays that are taken; None: as usual in the world.
         scans: at most so many scans, None for the whole street.
         gnss_hz: rate of the GNSS.
         errors: of the vehicle's sensors.
@@ -94,8 +94,8 @@ class DriveConfig:
     state: State = "after"
     direction: Direction = 1
     seed: int = 0
-    cruise_mps: float = 9.0
-    car_share: float = 0.2
+    cruise_mps: float | None = None
+    car_share: float | None = None
     scans: int | None = None
     gnss_hz: int = 10
     errors: SensorErrors = field(default_factory=SensorErrors)
@@ -166,13 +166,14 @@ class DriveSimulation:
         self._config = config
         self._world = world
         self._rng = np.random.default_rng([config.seed, world.seed])
-        style = DrivingStyle.drawn(self._rng, config.cruise_mps)
+        style = DrivingStyle.drawn(self._rng, world.cruise_mps if config.cruise_mps is None else config.cruise_mps)
         self.motion, duration_s = lane_motion(world, style, config.direction)
         whole = int(duration_s * config.model.rate_hz)
         self.scans = whole if config.scans is None else min(whole, config.scans)
         if self.scans < 1:
             raise DriveSimError(f"a drive needs at least one scan, got {self.scans} ({duration_s:.2f} s of street)")
-        cars = parked_cars(world, config.state, config.car_share, config.seed)
+        share = world.parking if config.car_share is None else config.car_share
+        cars = parked_cars(world, config.state, share, config.seed)
         shapes = (*world.shapes(config.state), *cars)
         self._scene = Scene.build(shapes, world.A_street_map)
         stage = Stage(world, shapes, self._scene, self.motion, self._seconds, config.seed)

@@ -13,12 +13,13 @@ from gnd.gnd_map.tile_id import TileId
 
 _HALF_M: Final = 1.6
 """A car is about 1.9 m wide and stands up to 0.3 m off the middle of its lane; voxels reach 0.5 m farther."""
+_BAY_M: Final = 3.2
 _LOW_M: Final = 0.0
 _HIGH_M: Final = 3.0
 
 
 def on_parking(world: World, truth: Truth) -> NDArray[np.bool_]:
-    """Return which voxels of the truth, bool (V,), a car on a parking lane may reach."""
+    """Return which voxels of the truth, bool (V,), a car on a parking lane or in a bay may reach."""
     found = np.zeros(len(truth), dtype=np.bool_)
     for morton in np.unique(truth.morton).tolist():
         tile = TileId(int(morton))
@@ -30,7 +31,9 @@ def on_parking(world: World, truth: Truth) -> NDArray[np.bool_]:
 
 
 def _on_parking(world: World, centre_street: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether points (N, 3) of the street frame lie where a car on a parking lane may be."""
-    across, above = np.abs(centre_street[:, 1]), centre_street[:, 2]
-    lane = np.abs(across - (world.kerb_m - LANE_M)) <= _HALF_M
-    return np.asarray(lane & (above >= _LOW_M) & (above <= _HIGH_M))
+    """Whether points (N, 3) of the street frame lie where a parked car may be."""
+    across, above = np.abs(centre_street[:, 1]), centre_street[:, 2] - world.relief_m(centre_street[:, 0])
+    where = np.abs(across - (world.kerb_m - LANE_M)) <= _HALF_M if world.kerb_parking else np.zeros(len(across), bool)
+    for bay in world.bays:
+        where |= np.hypot(centre_street[:, 0] - bay.x_m, centre_street[:, 1] - bay.y_m) <= _BAY_M
+    return np.asarray(where & (above >= _LOW_M) & (above <= _HIGH_M))

@@ -165,8 +165,9 @@ def _car(world: World, direction: Direction, way_m: FloatArray, style: int, phas
     wave, length_m = 0.12, 60.0
     x = direction * way_m
     turn = tau * x / length_m + phase_rad
-    y = -direction * world.lane_offset_m + wave * np.sin(turn)
-    yaw = (0.0 if direction > 0 else pi) + np.arctan(wave * tau / length_m * np.cos(turn))
-    track = np.stack([x, y, world.road_height_m(y), yaw, np.zeros_like(x)], axis=1)
+    offset, widening = world.lane_m(x)
+    y = -direction * offset + wave * np.sin(turn)
+    yaw = (0.0 if direction > 0 else pi) + np.arctan(wave * tau / length_m * np.cos(turn) - direction * widening)
+    track = np.stack([x, y, world.road_height_m(y, x), yaw, np.zeros_like(x)], axis=1)
     shapes = parts.car(0.0, 0.0, 0.0, 0.0, style)
     return Mover(shapes, (0.0,) * len(shapes), track)

@@ -10,6 +10,10 @@ has revealed is new to the map.
 
 Modified. A voxel with both Gaussians is modified when a quarter of its sub-cells lie on surfaces that went or came,
 farther than one sub-cell (10 to 20 cm) from every surface of the other state.
+
+Seasons. Leaves and snow ("seasonal" things of a world) that come or go change no map: leaves that are gone count as
+standing still, those that came as nothing. What they hid and reveal follows the rule above. `seasonal` tells which
+voxels they touch: whoever calls one of those changed has followed the season, and that is counted apart.
 """
 
 import hashlib
@@ -44,7 +48,7 @@ CHANGES: Final = (ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
 BoolArray = NDArray[np.bool_]
 
 _FORMAT: Final = "gnd.truth"
-_VERSION: Final = 1
+_VERSION: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +96,7 @@ class Truth:
         change_class: uint8 (V,), a `ChangeClass` from NORMAL to EMPTY.
         clear: bool (V,), not marginal.
         observable: bool (V,), near enough and visible.
+        seasonal: bool (V,), leaves or snow that come or go were met there in either state.
         before: Gaussians of the state before.
         after: Gaussians of what stands after.
     """
@@ -104,11 +109,14 @@ class Truth:
     change_class: NDArray[np.uint8]
     clear: BoolArray
     observable: BoolArray
+    seasonal: BoolArray
     before: Mapping[TileId, Gaussians] = field(repr=False)
     after: Mapping[TileId, Gaussians] = field(repr=False)
 
     def __post_init__(self) -> None:
-        sizes = {len(a) for a in (self.morton, self.voxel_id, self.change_class, self.clear, self.observable)}
+        sizes = {
+            len(a) for a in (self.morton, self.voxel_id, self.change_class, self.clear, self.observable, self.seasonal)
+        }
         if len(sizes) != 1:
             raise TruthError(f"truth columns have different lengths: {sorted(sizes)}")
         if len(self.change_class) and self.change_class.max() > ChangeClass.EMPTY:
@@ -167,6 +175,7 @@ def _truth_of_zone(world: World, scan: DenseScan, rules: TruthRules, plan: ScanP
         change_class=classes[order],
         clear=clear[order],
         observable=observable[order],
+        seasonal=scan.count(dense_scan.SEASONAL)[order] > 0,
         before=scan.before.finish(rules.n_min_cells),
         after=scan.after.finish(rules.n_min_cells),
     )
@@ -212,10 +221,15 @@ def observed(world: World, scan: DenseScan, classes: NDArray[np.uint8], rules: T
     centre = world.street_of_map(scan.grid_frame.centre_map_m(scan.g))
     near = np.abs(centre[:, 1]) <= rules.reach_m + world.lane_offset_m
     near &= np.abs(centre[:, 0]) <= world.half_length_m - rules.end_m
-    near &= (centre[:, 2] >= rules.low_m) & (centre[:, 2] <= rules.high_m)
+    above = centre[:, 2] - world.relief_m(centre[:, 0])
+    near &= (above >= rules.low_m) & (above <= rules.high_m)
     seen = scan.count(dense_scan.AFTER_KEPT | dense_scan.AFTER_COME) >= rules.seen_cells
     gone = (classes == ChangeClass.DELETED) | (classes == ChangeClass.EMPTY)
-    return np.asarray(near & np.where(gone, scan.passes[:, 1] >= rules.passes, seen))
+    free = scan.passes[:, 1] >= rules.passes
+    fallen = (
+        scan.count(dense_scan.LEAF_BEFORE) > 0
+    ) & free  # leaves that count as standing, but can be seen to be gone
+    return np.asarray(near & np.where(gone, free, seen | fallen))
 
 
 def _changed_share(scan: DenseScan) -> NDArray[np.float64]:
@@ -286,7 +300,7 @@ def load_or_make_truth(world: World, path: Path, plan: ScanPlan | None = None) -
     return truth
 
 
-_COLUMNS: Final = ("morton", "voxel_id", "change_class", "clear", "observable")
+_COLUMNS: Final = ("morton", "voxel_id", "change_class", "clear", "observable", "seasonal")
 _GAUSSIAN_COLUMNS: Final = ("voxel_id", "count", "cells", "mean_m", "cov_m2")
 
 

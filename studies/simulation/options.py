@@ -10,6 +10,7 @@ import numpy as np
 
 from gnd.cloud_merger.merge import MergeParameters
 from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig
+from gnd.fleet_sim.families.catalogue import FAMILIES
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import StreetOptions
 from gnd.fleet_sim.traffic import Traffic
@@ -140,6 +141,7 @@ def street_option(length_m: float) -> Any:
         StreetOptions,
         length_m=(length_m, Option("Length of the street, metres.", ("--length",))),
         site=("wangsimni", Option("Where it lies: wangsimni, border or north49.")),
+        family=("street", Option(f"Kind of place: {', '.join(FAMILIES)}.")),
     )
 
 
@@ -148,7 +150,7 @@ def sensors_option(default: tuple[str, ...], text: str) -> Any:
     return option(default, text, known=SHORT_NAMES)
 
 
-PARKING: Final = "Share of parking slots that are taken."
+PARKING: Final = "Share of parking slots that are taken; by default the usual one of the family, mostly 0.2."
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +166,7 @@ class RunOptions:
         read=lambda text: tuple(sorted(set(numbers("--vehicles", text)))),
     )
     sensors: tuple[str, ...] = sensors_option(tuple(SHORT_NAMES), "Sensors that the fleet cycles through.")
-    parking: float = option(0.2, PARKING, span=(0, 1))
+    parking: float | None = option(None, PARKING, span=(0, 1))
     traffic: bool = option(True, "Moving cars and pedestrians.")
     mode: Mode = option("default", "Whose rules.")
     poses: PoseSource = option(
