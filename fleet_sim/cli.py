@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from gnd.fleet_sim.families.catalogue import FAMILIES
+from gnd.fleet_sim.sensing import BEAMS, WEATHERS, Beams, Weather
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import SITES, StreetOptions, street
 from gnd.fleet_sim.world import STATES, World, read_world, write_world
@@ -99,6 +100,8 @@ def _note(made: World) -> str:
 @click.option("--vehicle", default="vehicle-0", show_default=True, help="Pseudonym of the vehicle.")
 @click.option("--cars", type=float, help="Share of parking slots that are taken.  [default: the world's, usually 0.2]")
 @click.option("--traffic", type=click.Choice(["none", "urban"]), default="none", show_default=True, help="Movers.")
+@click.option("--weather", type=click.Choice(WEATHERS), default="clear", show_default=True)
+@click.option("--beams", type=click.Choice(BEAMS), default="ideal", show_default=True, help="Real ones have a width.")
 @click.option("--scans", type=int, help="At most so many scans.")
 @click.option("--camera", is_flag=True, help="A camera that detects traffic signs, too.")
 def drive(
@@ -111,6 +114,8 @@ def drive(
     vehicle: str,
     cars: float | None,
     traffic: str,
+    weather: Weather,
+    beams: Beams,
     scans: int | None,
     camera: bool,
 ) -> None:
@@ -129,6 +134,8 @@ def drive(
         traffic=Traffic.urban() if traffic == "urban" else Traffic(),
         scans=scans,
         camera=SignCamera() if camera else None,
+        weather=weather,
+        beams=beams,
     )
     simulate_drive(read_world(world_file), config, file)
     click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

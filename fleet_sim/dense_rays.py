@@ -29,7 +29,7 @@ AFTER_KEPT: Final = 4
 AFTER_COME: Final = 8
 """Sub-cell hit after, on something that did not stand before."""
 LEAF_BEFORE: Final = 16
-"""Sub-cell hit before, on leaves or snow that are gone after; they count as standing still: no map changes by seasons."""
+"""Sub-cell hit before, on leaves or snow that are gone after; they count as standing: seasons change no map."""
 LEAF_AFTER: Final = 32
 """Sub-cell hit after, on leaves or snow that were not there before; there is nothing, for a map."""
 

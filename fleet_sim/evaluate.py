@@ -5,7 +5,7 @@ F1 is the macro average over five classes (normal, new, modified, deleted, empty
 Predictions are about the same voxels as the truth; what they say elsewhere is not counted.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -20,6 +20,8 @@ from gnd.gnd_map.tile import diff
 from gnd.gnd_map.tile_id import TileId
 
 Tiles = Mapping[TileId, Gaussians]
+I32 = NDArray[np.int32]
+BoolArray = NDArray[np.bool_]
 ClassArray = NDArray[np.uint8]
 
 CLASSES: Final = tuple(c for c in ChangeClass if c is not ChangeClass.UNMEASURED)
@@ -173,6 +175,24 @@ def classes_of_maps(truth: Truth, base: Tiles, final: Tiles) -> ClassArray:
         _assign(truth, predicted, tile, np.setdiff1d(put, old.voxel_id), ChangeClass.NEW)
         _assign(truth, predicted, tile, delta.removed, ChangeClass.DELETED)
     return predicted
+
+
+def false_elsewhere(truth: Truth, base: Tiles, final: Tiles, inside: Callable[[TileId, I32], BoolArray]) -> int:
+    """Return how many voxels a map has got of which the truth has none: no ray of the dense scan ever touched them.
+
+    Args:
+        truth: of the world.
+        base: the map before.
+        final: the map after.
+        inside: which voxels (K,) of a tile count, bool (K,).
+    """
+    count = 0
+    for tile, new in final.items():
+        old = base.get(tile, Gaussians.empty())
+        put = np.setdiff1d(new.voxel_id, old.voxel_id)
+        put = put[voxel_rows(truth, tile, put) < 0]
+        count += int(inside(tile, put).sum())
+    return count
 
 
 def _assign(

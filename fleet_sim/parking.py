@@ -1,4 +1,4 @@
-"""Where cars park: the voxels in which a parked car may be taken for a change of the map."""
+"""Where voxels of a world lie: on parking, where a car may be taken for a change of the map, and near its lanes."""
 
 from typing import Final
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.fleet_sim.cars import LANE_M
-from gnd.fleet_sim.truth import Truth
+from gnd.fleet_sim.truth import Truth, TruthRules, near
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile_id import TileId
@@ -24,10 +24,19 @@ def on_parking(world: World, truth: Truth) -> NDArray[np.bool_]:
     for morton in np.unique(truth.morton).tolist():
         tile = TileId(int(morton))
         low, high = np.searchsorted(truth.morton, [morton, morton + 1])
-        grid = GridFrame.around(truth.frame, [tile])
-        centre = world.street_of_map(grid.centre_map_m(grid.grid_of_voxel(tile, truth.voxel_id[low:high])))
-        found[low:high] = _on_parking(world, centre)
+        found[low:high] = _on_parking(world, centres_street_m(world, tile, truth.voxel_id[low:high]))
     return found
+
+
+def centres_street_m(world: World, tile: TileId, voxel_id: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Return the centres (K, 3) of voxels (K,) of a tile, street frame [m]."""
+    grid = GridFrame.around(world.frame, [tile])
+    return world.street_of_map(grid.centre_map_m(grid.grid_of_voxel(tile, voxel_id)))
+
+
+def near_lanes(world: World, tile: TileId, voxel_id: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Return which voxels (K,) of a tile are near enough to the lanes to be observable, bool (K,)."""
+    return near(world, centres_street_m(world, tile, voxel_id), TruthRules())
 
 
 def _on_parking(world: World, centre_street: NDArray[np.float64]) -> NDArray[np.bool_]:

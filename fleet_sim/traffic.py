@@ -23,6 +23,8 @@ from gnd.fleet_sim.world import World
 FloatArray = NDArray[np.float64]
 
 MAX_PER_100_M: Final = 10.0
+_NO_WALKING_MPS: Final = 13.0
+"""Nobody walks along a road on which vehicles are as fast as this."""
 _BEYOND_M: Final = 55.0
 """Cars come and go so far beyond the ends of the stretch that is driven; the ground reaches 5 m farther."""
 _BEHIND_M: Final = 150.0
@@ -75,7 +77,8 @@ def movers_of(traffic: Traffic, stage: Stage) -> Movers | None:
         for direction in (stage.motion.direction, -stage.motion.direction):
             cars += _lane(traffic, stage, 1 if direction > 0 else -1, rng)
     busy = [*((car.track[:, 0], car.track[:, 1]) for car in cars), stage.ego_m()]
-    people = pedestrians(_count(traffic.pedestrians_per_100m, stage), traffic.crossing_share, stage, busy, rng)
+    walking = _count(traffic.pedestrians_per_100m, stage) if stage.world.cruise_mps < _NO_WALKING_MPS else 0
+    people = pedestrians(walking, traffic.crossing_share, stage, busy, rng)
     if not cars and not people:
         return None
     reach_m = stage.world.half_length_m + _BEYOND_M

@@ -218,18 +218,22 @@ def marginal(scan: DenseScan, rules: TruthRules) -> BoolArray:
 
 def observed(world: World, scan: DenseScan, classes: NDArray[np.uint8], rules: TruthRules) -> BoolArray:
     """Return which voxels, bool (V,), are near enough to the lanes and were visible after the changes."""
-    centre = world.street_of_map(scan.grid_frame.centre_map_m(scan.g))
-    near = np.abs(centre[:, 1]) <= rules.reach_m + world.lane_offset_m
-    near &= np.abs(centre[:, 0]) <= world.half_length_m - rules.end_m
-    above = centre[:, 2] - world.relief_m(centre[:, 0])
-    near &= (above >= rules.low_m) & (above <= rules.high_m)
+    close = near(world, world.street_of_map(scan.grid_frame.centre_map_m(scan.g)), rules)
     seen = scan.count(dense_scan.AFTER_KEPT | dense_scan.AFTER_COME) >= rules.seen_cells
     gone = (classes == ChangeClass.DELETED) | (classes == ChangeClass.EMPTY)
     free = scan.passes[:, 1] >= rules.passes
     fallen = (
         scan.count(dense_scan.LEAF_BEFORE) > 0
     ) & free  # leaves that count as standing, but can be seen to be gone
-    return np.asarray(near & np.where(gone, free, seen | fallen))
+    return np.asarray(close & np.where(gone, free, seen | fallen))
+
+
+def near(world: World, centre_street: NDArray[np.float64], rules: TruthRules) -> BoolArray:
+    """Return which points (N, 3) of the street frame are near enough to the lanes, bool (N,)."""
+    found = np.abs(centre_street[:, 1]) <= rules.reach_m + world.lane_offset_m
+    found &= np.abs(centre_street[:, 0]) <= world.half_length_m - rules.end_m
+    above = centre_street[:, 2] - world.relief_m(centre_street[:, 0])
+    return np.asarray(found & (above >= rules.low_m) & (above <= rules.high_m))
 
 
 def _changed_share(scan: DenseScan) -> NDArray[np.float64]:

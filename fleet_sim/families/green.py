@@ -141,8 +141,8 @@ def _bank(name: str, x0: float, x1: float, side: int, high: float) -> WorldObjec
     half, middle = parts.rounded((x1 - x0) / 2), parts.rounded((x0 + x1) / 2)
     wide, level = 0.35, parts.rounded(-0.12 + 0.5 * high)
     shapes = [
-        Block(middle, parts.rounded(side * KERB_M + out * wide), half, wide, -0.3, level, rise_y=-out * high / (2 * wide),
-              reflectivity=0.8)
+        Block(middle, parts.rounded(side * KERB_M + out * wide), half, wide, -0.3, level,
+              rise_y=-out * high / (2 * wide), reflectivity=0.8)
         for out in (1.0, -1.0)
     ]  # fmt: skip
     return seasonal(name, "snow", "after", *shapes)

@@ -183,7 +183,7 @@ def _tube_furniture(side: int, mouth: float, end: float, rng: np.random.Generato
 
 def _new_at_the_tunnel(mouth: float, half: float, rng: np.random.Generator) -> list[WorldObject]:
     found: list[WorldObject] = []
-    for index in range(4):
+    for index in range(8):
         side, x = (1 if rng.random() < 0.5 else -1), float(rng.uniform(mouth + 6.0, half - 8.0))
         panels = [
             parts.slab(x + 2.0 * k, x + 2.0 * k + 1.9, side * (_TUBE_M - 0.35), side * (_TUBE_M - 0.28), 0.2, 3.0)

@@ -141,7 +141,7 @@ def renewed(
 
 
 def out_of_the_lanes(objects: Sequence[WorldObject], place: FamilyPlace) -> tuple[WorldObject, ...]:
-    """Return the things without those that stand in a vehicle's way; a thing that was moved there stays where it was."""
+    """Return the things without those that stand in a vehicle's way; one that was moved there stays where it was."""
     bad = {(o.name, o.edit) for o in objects if any(_in_the_way(shape, place) for shape in o.shapes)}
     found: list[WorldObject] = []
     for o in objects:

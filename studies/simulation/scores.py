@@ -3,7 +3,8 @@
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.merge import MergeParameters
-from gnd.fleet_sim.evaluate import CLASSES, Evaluation, Score, Tiles, evaluate_maps, kept_changes
-from gnd.fleet_sim.parking import on_parking
+from gnd.fleet_sim.evaluate import CLASSES, Evaluation, Score, Tiles, evaluate_maps, false_elsewhere, kept_changes
+from gnd.fleet_sim.parking import near_lanes, on_parking
 from gnd.fleet_sim.truth import CHANGES, LEVELS, Level, read_truth
 from gnd.fleet_sim.world import read_world
 from gnd.gnd_map.classes import ChangeClass
@@ -37,6 +38,9 @@ AIM: Final = {"single": 96.0, "fleet.20": 98.5, "fleet.20.all": 92.0, "fleet.9.s
 
 
 STALE = "stale"
+FALSE_WHERE: Final = ("false_on_parking", "false_seasonal", "false_elsewhere")
+"""Called new on parking lanes; called changed where only leaves or snow came or went; called new near the lanes where
+no ray of the truth's dense scan came, as behind glass or under a wet road."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,16 +49,17 @@ class Scored:
 
     Attributes:
         confusion: matrices int64 (5, 5) by level, rows true, columns predicted.
-        false_on_parking: unchanged voxels on parking lanes that are called new, of all that the truth holds.
+        false_where: number of unchanged voxels that are called changed, by what is there, see `FALSE_WHERE`; of all
+            voxels that the truth holds, and beside them.
     """
 
     confusion: dict[Level, NDArray[np.int64]]
-    false_on_parking: int = 0
+    false_where: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, evaluation: Evaluation, false_on_parking: int = 0) -> "Scored":
+    def of(cls, evaluation: Evaluation, false_where: Mapping[str, int] | None = None) -> "Scored":
         """Keep the matrices of an evaluation."""
-        return cls({level: evaluation.scores[level].confusion for level in LEVELS}, false_on_parking)
+        return cls({level: evaluation.scores[level].confusion for level in LEVELS}, false_where or {})
 
     def score(self, level: Level) -> Score:
         """Return the score of a level."""
@@ -87,15 +92,18 @@ class MapScorer:
 
     def __init__(self, files: WorldFiles) -> None:
         self.base = read_world_base(files)
-        self._truth = read_truth(files.truth)
-        self._parking = on_parking(read_world(files.world), self._truth)
+        self._truth, self._world = read_truth(files.truth), read_world(files.world)
+        self._parking = on_parking(self._world, self._truth)
 
     def score(self, final: Tiles) -> Scored:
         """Return the score of what became of the base map."""
-        evaluation = evaluate_maps(self._truth, self.base.tiles, final)
-        unchanged = ~np.isin(self._truth.change_class, CHANGES)
-        false = (evaluation.predicted == ChangeClass.NEW) & unchanged & self._parking
-        return Scored.of(evaluation, int(false.sum()))
+        truth, base = self._truth, self.base.tiles
+        evaluation = evaluate_maps(truth, base, final)
+        false = np.isin(evaluation.predicted, CHANGES) & ~np.isin(truth.change_class, CHANGES)
+        parked = false & self._parking & (evaluation.predicted == ChangeClass.NEW)
+        elsewhere = false_elsewhere(truth, base, final, partial(near_lanes, self._world))
+        where = {"false_on_parking": parked, "false_seasonal": false & truth.seasonal}
+        return Scored.of(evaluation, {n: int(v.sum()) for n, v in where.items()} | {"false_elsewhere": elsewhere})
 
 
 def score_single(files: WorldFiles, vehicles: Sequence[VehicleFile]) -> dict[str, Scored]:
@@ -241,7 +249,7 @@ def _world_summary(world: WorldOutcome) -> dict[str, Any]:
         "fleet": {str(n): _stage([scored]) for n, scored in world.fleet.items()},
         "kept": largest.kept,
         "false_per_1000": largest.score("observable").false_per_1000,
-        "false_on_parking": largest.false_on_parking,
+        **{name: largest.false_where[name] for name in FALSE_WHERE},
         "upload_bytes": _uploads(world, by_sensor),
         **({"pcd": _pcd(world, by_sensor)} if world.pcd else {}),
         "drives": {sensor: _drives(world, names) for sensor, names in by_sensor.items()},
@@ -262,7 +270,7 @@ def _stage(maps: Sequence[Scored]) -> dict[str, Any]:
         "f1": {level: _mean(scored.f1(level) for scored in maps) for level in LEVELS},
         "changes_f1": {level: _mean(scored.score(level).changes_f1 for scored in maps) for level in LEVELS},
         "false_per_1000": mean_of([scored.score("observable").false_per_1000 for scored in maps]),
-        "false_on_parking": _mean(float(scored.false_on_parking) for scored in maps),
+        **{name: _mean(float(scored.false_where.get(name, 0)) for scored in maps) for name in FALSE_WHERE},
         "classes": {level: mean_of([_classes(scored, level) for scored in maps]) for level in LEVELS},
     }
 

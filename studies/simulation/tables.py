@@ -95,6 +95,12 @@ def _scores(found: Found, asked: Sequence[int]) -> Sheet:
     return table
 
 
+def _where(found: Found) -> str:
+    words = ("new on parking lanes", "by the season", "new where nothing is")
+    counts = (found[name] for name in reference.FALSE_WHERE)
+    return ", ".join(f"{count:g} {what}" for count, what in zip(counts, words, strict=True))
+
+
 def kept_line(kept: Found) -> str:
     """Return what the levels leave out of the true changes, which every F1 beside them needs."""
     left = {level: ", ".join(f"{100 - share:.0f} % of {name}" for name, share in kept[level].items()) for level in kept}
@@ -106,9 +112,7 @@ def notes_of(found: Found) -> list[str]:
     counts = [drive["segmentation"] for drive in found["drives"].values() if drive.get("segmentation")]
     lines = [kept_line(found["kept"])]
     false = ", ".join(f"{count:.2f} {name}" for name, count in found["false_per_1000"].items())
-    lines.append(
-        f"False changes of 1,000 observable voxels: {false}; {found['false_on_parking']:g} new on parking lanes."
-    )
+    lines.append(f"False changes of 1,000 observable voxels: {false}; {_where(found)}.")
     total = {name: sum(count[name] for count in counts) for name in (counts[0] if counts else ())}
     if total and total["movers"]:
         left, lost = 100 * total["movers_left"] / total["movers"], 100 * total["static_lost"] / total["static"]
