@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from gnd.fleet_sim.families.catalogue import FAMILIES
+from gnd.fleet_sim.families.names import FAMILY_NAMES
 from gnd.fleet_sim.sensing import BEAMS, WEATHERS, Beams, Weather
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import SITES, StreetOptions, street
@@ -32,7 +32,7 @@ def world() -> None:
 @click.option("--site", type=click.Choice(SITES), default="border", show_default=True, help="Where the street lies.")
 @click.option("--lat", "lat_deg", type=float, help="Latitude of its middle in degrees, instead of a site.")
 @click.option("--lon", "lon_deg", type=float, help="Longitude of its middle in degrees, instead of a site.")
-@click.option("--family", type=click.Choice(list(FAMILIES)), default="street", show_default=True, help="Kind of place.")
+@click.option("--family", type=click.Choice(FAMILY_NAMES), default="street", show_default=True, help="Kind of place.")
 @click.option("--parking", type=float, help="Share of parking slots that are taken on its drives, 0 to 1.")
 @click.option("--edits", "edit_share", default=1.0, show_default=True, help="Share of the street's edits to make.")
 def write(file: Path, seed: int, **options: Any) -> None:

@@ -1,7 +1,6 @@
-"""The families by name, and which of them nothing may be tuned on."""
+"""The families by name."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from gnd.fleet_sim.families.green import avenue, snow, suburb
@@ -10,34 +9,20 @@ from gnd.fleet_sim.families.site import FamilyPlace, FamilySite
 from gnd.fleet_sim.families.works import car_park, construction, roundabout
 
 
-@dataclass(frozen=True, slots=True)
-class Family:
-    """A kind of place.
-
-    Attributes:
-        build: makes a place of it from what a seed has drawn.
-        reserved: for tests only: no parameter and no model may be chosen by its worlds.
-        about: what is hard there.
-    """
-
-    build: Callable[[FamilySite], FamilyPlace]
-    reserved: bool
-    about: str
-
-
-def _street(site: FamilySite) -> FamilyPlace:
-    """The usual street, as it always was."""
+def usual_street(site: FamilySite) -> FamilyPlace:
+    """The usual street, to the bit as it was before there were families."""
     return FamilyPlace(site.street())
 
 
-FAMILIES: Final[dict[str, Family]] = {
-    "street": Family(_street, False, "the usual street"),
-    "suburb": Family(suburb, False, "gardens with hedges and fences, a road over a hill"),
-    "avenue": Family(avenue, False, "porous trees whose leaves come and go between the states, shop windows"),
-    "motorway": Family(motorway, False, "noise barriers, rails, few things; fast vehicles"),
-    "snow": Family(snow, False, "the usual street with banks of snow after"),
-    "car_park": Family(car_park, True, "cars and vans that change between drives, not between the states of the map"),
-    "construction": Family(construction, True, "fences, containers, excavators all along"),
-    "roundabout": Family(roundabout, True, "lanes that swing around an island"),
-    "tunnel": Family(tunnel, True, "a cutting and a smooth tube"),
+FAMILIES: Final[Mapping[str, Callable[[FamilySite], FamilyPlace]]] = {
+    "street": usual_street,
+    "suburb": suburb,
+    "avenue": avenue,
+    "motorway": motorway,
+    "snow": snow,
+    "car_park": car_park,
+    "construction": construction,
+    "roundabout": roundabout,
+    "tunnel": tunnel,
 }
+"""What makes a place of each of `names.FAMILY_NAMES` from what a seed has drawn."""

@@ -11,7 +11,7 @@ import numpy as np
 from gnd.cloud_merger.merge import MergeParameters
 from gnd.fleet_sim.cars import MAX_STAY_H
 from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig
-from gnd.fleet_sim.families.catalogue import FAMILIES
+from gnd.fleet_sim.families.names import FAMILY_NAMES
 from gnd.fleet_sim.sensing import Beams, Weather
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import StreetOptions
@@ -143,7 +143,7 @@ def street_option(length_m: float) -> Any:
         StreetOptions,
         length_m=(length_m, Option("Length of the street, metres.", ("--length",))),
         site=("wangsimni", Option("Where it lies: wangsimni, border or north49.")),
-        family=("street", Option(f"Kind of place: {', '.join(FAMILIES)}.")),
+        family=("street", Option(f"Kind of place: {', '.join(FAMILY_NAMES)}.")),
     )
 
 
