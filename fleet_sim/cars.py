@@ -75,14 +75,13 @@ def parked_cars(
         taken += [shape.bounds() for shape in world.shapes(state) if _stands_up(shape)]
     cars: list[Shape] = []
     for number, slot in enumerate(_slots(world)):
-        here, chance = None, rng
-        if stays is not None and stays.mean_h > 0.0:
-            here, chance = stays.chance(world.seed, number, occupancy)
+        lasting = stays is not None and stays.mean_h > 0.0
+        here, chance = stays.chance(world.seed, number, occupancy) if stays is not None and lasting else (False, rng)
         drawn = chance.random() < occupancy
         dx, dy = float(chance.normal(0.0, slot.along_m)), float(chance.normal(0.0, 0.12))
         turned, style = float(chance.normal(0.0, 0.02)), int(chance.integers(2**31))
         x, y = slot.bay.x_m + dx, slot.bay.y_m + slot.side * dy
-        if (drawn if here is None else here) and not _hits(taken, x, y, abs(sin(slot.bay.yaw_rad)) > 0.5):
+        if (here if lasting else drawn) and not _hits(taken, x, y, abs(sin(slot.bay.yaw_rad)) > 0.5):
             make = parts.delivery_van if slot.bay.van else parts.car
             cars += make(x, y, _ground_m(world, x, y), turned + slot.bay.yaw_rad, style)
     return tuple(cars)

@@ -66,7 +66,7 @@ def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
 
     made = read_world(file)
     truth = load_or_make_truth(made, truth_file) if truth_file else make_truth(made)
-    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}", _note(made), dpi=dpi)
+    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}{_family(made)}", _note(made), dpi=dpi)
     click.echo(f"{png}: {', '.join(f'{n} {name}' for name, n in truth.counts('all').items())}")
 
 
@@ -83,6 +83,10 @@ def features(file: Path, layers: Path, mapped_streetlights: float) -> None:
     write_feature_layers(base_features(truth), layers)
     for layer, states in truth.counts().items():
         click.echo(f"{layer}: {', '.join(f'{n} {state}' for state, n in states.items())}")
+
+
+def _family(made: World) -> str:
+    return "" if made.family == "street" else f", {made.family}"
 
 
 def _note(made: World) -> str:

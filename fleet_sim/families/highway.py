@@ -137,7 +137,7 @@ def tunnel(site: FamilySite) -> FamilyPlace:
         "fan": Renewal(0.3, 0.3, 4.0, 0.0),
         "sign": Renewal(0.3, 0.3, 3.0, 0.0),
         "cabinet": Renewal(0.3, 0.3, 1.5, 0.0),
-        "lamp": Renewal(0.1, 0.1, 1.0, 0.0),
+        "tube light": Renewal(0.1, 0.1, 1.0, 0.0),
         "bush": Renewal(0.3, 0.0),
         "rib": Renewal(0.1, 0.15, 0.6, 0.0),
     }
@@ -166,7 +166,7 @@ def _tube_furniture(side: int, mouth: float, end: float, rng: np.random.Generato
     inside = np.arange(mouth + 4.0, end - 4.0, 7.0).tolist()
     for index, x in enumerate(inside):
         lamp = parts.slab(x - 0.6, x + 0.6, side * 2.8, side * 3.1, _ROOF_M - 0.25, _ROOF_M - 0.05, parts.METAL)
-        found.append(kept(f"lamp {side:+d} {index}", "lamp", lamp))
+        found.append(kept(f"tube light {side:+d} {index}", "tube light", lamp))
         rib = parts.slab(x + 3.0, x + 3.4, side * (_TUBE_M - 0.2), side * _TUBE_M, -0.2, _ROOF_M)
         found.append(kept(f"tube rib {side:+d} {index}", "rib", rib))
     for index, x in enumerate(inside[1::3]):

@@ -12,6 +12,7 @@ from sim_worlds import BOTH, COARSE, small_world, thing
 
 from gnd.deploy.cli import gnd
 from gnd.fleet_sim import parts
+from gnd.fleet_sim.camera import SignCamera
 from gnd.fleet_sim.cars import Stays, parked_cars
 from gnd.fleet_sim.dense_scan import ScanPlan
 from gnd.fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation
@@ -19,14 +20,17 @@ from gnd.fleet_sim.errors import WorldError
 from gnd.fleet_sim.evaluate import evaluate, false_elsewhere
 from gnd.fleet_sim.families.catalogue import FAMILIES
 from gnd.fleet_sim.families.names import FAMILY_NAMES, RESERVED
+from gnd.fleet_sim.feature_truth import feature_truth
 from gnd.fleet_sim.parking import centres_street_m, near_lanes, on_parking
 from gnd.fleet_sim.raycast import Scene
 from gnd.fleet_sim.shapes import Ball, Post
 from gnd.fleet_sim.street import StreetOptions, street
+from gnd.fleet_sim.traffic import Traffic
 from gnd.fleet_sim.truth import CHANGES, make_truth
 from gnd.fleet_sim.world import STATES, World, WorldObject, from_json, to_json
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import Scan
 
 HARDER = tuple(name for name in FAMILY_NAMES if name != "street")
 SPARSE = ScanPlan(spacing_m=5.0, step_rad=np.radians(0.9))
@@ -38,7 +42,7 @@ PINNED = {
     "car_park": "e7102b1a814f100e",
     "construction": "6eb4e1d38d0d033e",
     "roundabout": "21a1015061c2ce36",
-    "tunnel": "2c14aa93469172a1",
+    "tunnel": "22c27c6914276ffd",
 }
 
 
@@ -250,6 +254,16 @@ def test_voxels_that_no_ray_of_the_truth_touched_are_counted_near_the_lanes_only
     found = false_elsewhere(truth, {tile: old}, {tile: made}, lambda t, v: near_lanes(world, t, v))
     assert found == len(near) == 3
     assert false_elsewhere(truth, {tile: old}, {tile: old}, lambda t, v: near_lanes(world, t, v)) == 0
+
+
+@pytest.mark.parametrize("family", HARDER)
+def test_feature_layers_and_cameras_work_in_every_family(family: str) -> None:
+    world = place(family)
+    assert feature_truth(world).of("signs")
+    config = DriveConfig("car", "VLP-16", scans=2, camera=SignCamera(), traffic=Traffic.urban())
+    items = list(DriveSimulation(world, config).items())
+    assert sum(isinstance(item, Scan) for item in items) == 2
+    assert all(len(item.points_m) > 5000 for item in items if isinstance(item, Scan))
 
 
 def test_family_and_parking_are_options_of_the_command(tmp_path) -> None:
