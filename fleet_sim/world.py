@@ -225,14 +225,14 @@ class World:
         """Return the height of the ground over the reference plane at x (N,) [m]; 0 everywhere on level ground."""
         if not self.relief:
             return np.zeros_like(x_street_m)
-        return np.interp(x_street_m, *np.array(self.relief).T)
+        return np.asarray(np.interp(x_street_m, *np.array(self.relief).T))
 
     def grade(self, x_street_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the rise a metre at x (N,) as a vehicle feels it: straight between the middles of the pieces."""
         if len(self.relief) < 2:
             return np.zeros_like(x_street_m)
         x, height = np.array(self.relief).T
-        return np.interp(x_street_m, 0.5 * (x[1:] + x[:-1]), np.diff(height) / np.diff(x))
+        return np.asarray(np.interp(x_street_m, 0.5 * (x[1:] + x[:-1]), np.diff(height) / np.diff(x)))
 
     def lane_m(self, x_street_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return how far a lane's middle is from the road's at x (N,) [m], and by how much that grows a metre."""
