@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from gnd.deploy.map_export.command import diff, export
+from gnd.deploy.map_export.serve import serve
 from gnd.deploy.tile_memory_cli import memory
 from gnd.deploy.vehicle_rollback_cli import rollback
 from gnd.deploy.verify_cli import verify
@@ -111,9 +112,9 @@ def _bars() -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
 
 
-_COMMANDS = {**store_group.commands, "rollback": rollback, "export": export, "diff": diff}
+_COMMANDS = {**store_group.commands, "rollback": rollback, "export": export, "serve": serve, "diff": diff}
 map_group = click.Group(
     "map",
     commands=[build, align, verify, memory, *_COMMANDS.values()],
-    help="Build, align, inspect, compare, export, verify and roll back maps.",
+    help="Build, align, inspect, compare, export, serve, verify and roll back maps.",
 )
