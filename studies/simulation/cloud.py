@@ -13,7 +13,7 @@ from gnd.cloud_merger.expanding import base_versions, expand, is_askable, with_m
 from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.merge import MergeParameters, merge_tile
 from gnd.cloud_merger.parked import hold_parked
-from gnd.cloud_merger.statements import Mode, Report, statements_of
+from gnd.cloud_merger.statements import Report, statements_of
 from gnd.cloud_merger.votes import TileVotes
 from gnd.cloud_merger.wants import Known, WantParameters, wanted
 from gnd.gnd_map.arrays import are_in
@@ -46,30 +46,30 @@ def reports_of_tiles(bodies: Iterable[bytes], parameters: MergeParameters) -> di
     return dict(found)
 
 
-def merged_map(base: BaseMap, bodies: Sequence[bytes], parameters: MergeParameters) -> dict[TileId, Gaussians]:
-    """Return the map that the cloud makes of a base map and uploads."""
+def merged_map(
+    base: BaseMap, bodies: Sequence[bytes], parameters: MergeParameters, parked_h: float = PARKED_H
+) -> dict[TileId, Gaussians]:
+    """Return the map that the cloud makes of a base map and uploads; `parked_h`: see `ConfirmationParameters`."""
     final = dict(base.tiles)
     for tile, reports in reports_of_tiles(bodies, parameters).items():
         epoch = base.tiles.get(tile, Gaussians.empty())
         bases = {base.shas[tile]: epoch} if tile in base.shas else {}
         merged = merge_tile(epoch, statements_of(epoch, reports, bases, parameters.mode), parameters)
-        if parameters.mode == "default":
-            merged = hold_parked(epoch, merged, reports, NOTHING_PARKED, bases, PARKED_H).merged
-        final[tile] = merged.gaussians
+        final[tile] = hold_parked(epoch, merged, reports, NOTHING_PARKED, bases, parked_h).merged.gaussians
     return final
 
 
-def map_of_one(base: BaseMap, bodies: Iterable[bytes], mode: Mode = "default") -> dict[TileId, Gaussians]:
+def map_of_one(base: BaseMap, bodies: Iterable[bytes], parked_h: float = PARKED_H) -> dict[TileId, Gaussians]:
     """Return the base map with what one vehicle reports, no cloud in between.
 
-    What has the shape of a standing vehicle is no change, in default mode: whoever takes the report sees it as well.
+    What has the shape of a standing vehicle is no change, unless `parked_h` is 0: whoever takes the report sees it.
     """
     final = dict(base.tiles)
     for tile, reports in reports_of_tiles(bodies, MergeParameters()).items():
         before = final.get(tile, Gaussians.empty())
         for report in reports:
             final[tile] = _with_change(final.get(tile, Gaussians.empty()), report.change)
-        if mode == "default":
+        if parked_h > 0.0:
             final[tile] = _without_parked(tile, before, final[tile])
     return final
 

@@ -91,6 +91,7 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
 BASE_DIFFERS: Final = "the base map differs from the truth's"
 MARGINAL: Final = "marginal in the truth"
 TOO_FAR: Final = "hardly observable"
+SEASON: Final = "leaves or snow"
 POSES: Final = "right with true poses"
 
 
@@ -153,7 +154,8 @@ def fleet_losses(case: LossCase, n: int, level: Level) -> list[Loss]:
 def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bool = False) -> ClassArray:
     """Return the class, uint8 (V,), of each voxel after the vehicles' reports, merged or of one vehicle alone."""
     bodies = [body for vehicle in vehicles for body in vehicle.reports]
-    final = merged_map(case.base, bodies, case.method.merge) if merge else map_of_one(case.base, bodies)
+    parked_h, merging = case.method.parked_h, case.method.merge
+    final = merged_map(case.base, bodies, merging, parked_h) if merge else map_of_one(case.base, bodies, parked_h)
     return classes_of_maps(case.truth, case.base.tiles, final)
 
 
@@ -210,6 +212,7 @@ def _with_circumstances(case: LossCase, rows: I64, found: Causes, exact: ClassAr
     if exact is not None:
         found = np.where(exact[rows] == true, np.char.add(f"{POSES}; ", found), found)
     names = np.where(truth.observable[rows], found, np.char.add(f"{TOO_FAR}; ", found))
+    names = np.where(truth.seasonal[rows], np.char.add(f"{SEASON}; ", names), names)
     names = np.where(truth.clear[rows], names, np.char.add(f"{MARGINAL}; ", found))
     return np.where(was_there == case.in_base()[rows], names, BASE_DIFFERS)
 

@@ -8,8 +8,12 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from gnd.cloud_merger.confirmation import ConfirmationParameters
 from gnd.cloud_merger.merge import MergeParameters
+from gnd.fleet_sim.cars import MAX_STAY_H
 from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig
+from gnd.fleet_sim.families.names import FAMILY_NAMES
+from gnd.fleet_sim.sensing import Beams, Weather
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import StreetOptions
 from gnd.fleet_sim.traffic import Traffic
@@ -101,6 +105,12 @@ class MethodParameters:
     detect: DetectParameters = setting(DetectParameters, "Detection.")
     report: ReportParameters = setting(ReportParameters, "Reports.")
     merge: MergeParameters = setting(MergeParameters, "The merge.")
+    confirmation: ConfirmationParameters = setting(ConfirmationParameters, "Of it `parked_h` alone.")
+
+    @property
+    def parked_h(self) -> float:
+        """How long what has the shape of a vehicle must have stood; 0 in paper mode, which does not know it."""
+        return self.confirmation.parked_h if self.merge.mode == "default" else 0.0
 
     @classmethod
     def of_mode(cls, mode: Mode) -> "MethodParameters":
@@ -140,6 +150,7 @@ def street_option(length_m: float) -> Any:
         StreetOptions,
         length_m=(length_m, Option("Length of the street, metres.", ("--length",))),
         site=("wangsimni", Option("Where it lies: wangsimni, border or north49.")),
+        family=("street", Option(f"Kind of place: {', '.join(FAMILY_NAMES)}.")),
     )
 
 
@@ -148,7 +159,7 @@ def sensors_option(default: tuple[str, ...], text: str) -> Any:
     return option(default, text, known=SHORT_NAMES)
 
 
-PARKING: Final = "Share of parking slots that are taken."
+PARKING: Final = "Share of parking slots that are taken; by default the usual one of the family, mostly 0.2."
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,14 +175,14 @@ class RunOptions:
         read=lambda text: tuple(sorted(set(numbers("--vehicles", text)))),
     )
     sensors: tuple[str, ...] = sensors_option(tuple(SHORT_NAMES), "Sensors that the fleet cycles through.")
-    parking: float = option(0.2, PARKING, span=(0, 1))
-    hours: float | None = option(
-        None,
-        "All vehicles drive within so many hours and meet the cars that stand then; without it an hour lies between "
-        "two drives, and each meets cars of its own.",
-        span=(0, 10_000),
-    )
+    parking: float | None = option(None, PARKING, span=(0, 1))
     traffic: bool = option(True, "Moving cars and pedestrians.")
+    weather: Weather = option("clear", "Weather of the drives after the changes.")
+    beams: Beams = option("ideal", "Beams of the LiDARs; real ones have a width: mixed pixels, bias, blooming signs.")
+    apart_min: float = option(60.0, "Minutes between the starts of two vehicles.", "--apart", span=(0, 1e5))
+    stay_h: float = option(
+        0.0, "Mean stay of a parked car in hours; 0: every drive meets others.", "--stay", span=(0, MAX_STAY_H)
+    )
     mode: Mode = option("default", "Whose rules.")
     poses: PoseSource = option(
         PoseSource(), "estimated, true, or noisy:<m>:<deg>; true,estimated compares.",
@@ -196,7 +207,7 @@ class RunOptions:
         return max(*self.vehicles, len(self.sensors))
 
 
-_HOUR_NS = 3_600 * 1_000_000_000
+_MINUTE_NS: Final = 60 * 1_000_000_000
 
 
 def fleet_sensors(options: RunOptions, seed: int) -> tuple[str, ...]:
@@ -211,7 +222,6 @@ def fleet_configs(options: RunOptions, seed: int) -> tuple[DriveConfig, ...]:
     Directions alternate, and each sensor drives both ways.
     """
     sensors, round_trip = fleet_sensors(options, seed), len(options.sensors)
-    step_h = 1.0 if options.hours is None else options.hours / max(options.fleet_size - 1, 1)
     return tuple(
         DriveConfig(
             vehicle=f"vehicle-{index:02d}",
@@ -219,10 +229,12 @@ def fleet_configs(options: RunOptions, seed: int) -> tuple[DriveConfig, ...]:
             direction=1 if (index + index // round_trip * (round_trip % 2 == 0)) % 2 == 0 else -1,
             seed=1_000_003 * seed + index,
             car_share=options.parking,
-            hours=None if options.hours is None else round(index * step_h, 6),
             traffic=Traffic.urban() if options.traffic else Traffic(),
             scans=options.scans,
-            start_ns=EPOCH_NS + round(index * step_h * _HOUR_NS),
+            start_ns=EPOCH_NS + index * round(options.apart_min * _MINUTE_NS),
+            weather=options.weather,
+            beams=options.beams,
+            stay_h=options.stay_h,
         )
         for index, sensor in enumerate(sensors)
     )

@@ -120,11 +120,12 @@ def _scores(
     """Scores of every world; the curve over the number of vehicles is shared out among the processes."""
     many = range(1, max(options.vehicles) + 1)  # dealt out so that every share has small and large ones
     shares = [share for k in range(bench.processes) if (share := list(many[k :: bench.processes]))]
-    jobs, merge, upload = [], options.method.merge, options.upload
+    jobs, merge, upload, parked_h = [], options.method.merge, options.upload, options.method.parked_h
     for seed, of_world in vehicles.items():
-        jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world, merge.mode)))
+        jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world, parked_h)))
         jobs += [
-            Job(f"merges, world {seed}", score_fleet, (files[seed], of_world, share, merge, upload)) for share in shares
+            Job(f"merges, world {seed}", score_fleet, (files[seed], of_world, share, merge, upload, parked_h))
+            for share in shares
         ]
         jobs.append(Job(f"uploads, world {seed}", sent_bytes, (files[seed], of_world, merge, upload)))
         if options.pcd:
@@ -137,7 +138,7 @@ def _scores(
         sent = next(results)
         pcd = next(results) if options.pcd else {}
         read = tuple(vehicle.read() for vehicle in of_world)
-        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), single, fleet, sent, pcd))
+        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), options.vehicles, single, fleet, sent, pcd))
     return tuple(found)
 
 
