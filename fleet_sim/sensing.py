@@ -56,7 +56,7 @@ _SKIN_M: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shots:
+class SweepShots:
     """The shots of a sweep in the street frame, as `ray_kernels.cast_sweep` takes them.
 
     Attributes:
@@ -91,7 +91,7 @@ class Disturbance:
         """Whether anything is disturbed at all."""
         return bool(self._rain or self._beams or self._glass.any())
 
-    def disturb(self, scene: Scene, packed: FloatArray, shots: Shots, t_s: float, met: Returns) -> None:
+    def disturb(self, scene: Scene, packed: FloatArray, shots: SweepShots, t_s: float, met: Returns) -> None:
         """Change ranges, primitives and incidences of a sweep as they were met without any disturbance.
 
         Args:
@@ -117,7 +117,7 @@ class Disturbance:
         inside = (primitive >= 0) & (primitive < len(mask))
         return inside & mask[np.where(inside, primitive, 0)]
 
-    def _glazed(self, scene: Scene, shots: Shots, met: Returns, rng: np.random.Generator) -> None:
+    def _glazed(self, scene: Scene, shots: SweepShots, met: Returns, rng: np.random.Generator) -> None:
         ranges, primitive, incidence = met
         glass, draw = self._of(self._glass, primitive), rng.random((2, *ranges.shape))
         answers = np.where(incidence > _GLASS_HEAD_ON, _GLASS_ANSWERS[1], _GLASS_ANSWERS[0])
@@ -130,7 +130,7 @@ class Disturbance:
         rest = np.where(kind < _GLASS_MIRRORED + _GLASS_THROUGH, room, np.inf)
         _put(met, (column, beam), np.where(kind < _GLASS_MIRRORED, mirrored, rest), shots.range_m)
 
-    def _wet_road(self, scene: Scene, shots: Shots, met: Returns, rng: np.random.Generator) -> None:
+    def _wet_road(self, scene: Scene, shots: SweepShots, met: Returns, rng: np.random.Generator) -> None:
         ranges, primitive, incidence = met
         draw = rng.random((2, *ranges.shape))
         lost = self._of(self._ground, primitive) & (draw[0] < np.exp(-incidence / _WET_COSINE))
@@ -143,7 +143,7 @@ class Disturbance:
 Picked = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
-def _mirrored(scene: Scene, shots: Shots, picked: Picked, near_m: FloatArray, axis: int) -> FloatArray:
+def _mirrored(scene: Scene, shots: SweepShots, picked: Picked, near_m: FloatArray, axis: int) -> FloatArray:
     """Ranges (K,) at which shots appear that are mirrored where they met something, inf where they meet nothing more.
 
     The mirror is perpendicular to an axis of the street frame: 1 for fronts, 2 for the road.

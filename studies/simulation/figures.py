@@ -40,14 +40,14 @@ def draw_changes(outcome: SimulationOutcome, world: WorldOutcome, truth: Truth, 
     base, true = read_world_base(world.files), ellipsoids_of_truth(truth)
     view, n = StreetView.around(true), max(outcome.options.vehicles)
     one = next((vehicle for vehicle in world.vehicles if vehicle.sensor in reference.TARGET_SENSORS), world.vehicles[0])
-    merge = outcome.options.method.merge
+    merge, parked_h = outcome.options.method.merge, outcome.options.method.parked_h
     held = arrived(base, world.vehicles[:n], merge, outcome.options.upload)
-    merged = merged_map(base, [body for sent in held for body in sent.bodies], merge)
+    merged = merged_map(base, [body for sent in held for body in sent.bodies], merge, parked_h)
     alone, fleet = (
         f"F1 {scored.f1():.2f} % of observable voxels" for scored in (world.single[one.vehicle], world.fleet[n])
     )
     pictures = (
-        ("single.png", ellipsoids_of_maps(truth.frame, base.tiles, map_of_one(base, one.reports)),
+        ("single.png", ellipsoids_of_maps(truth.frame, base.tiles, map_of_one(base, one.reports, parked_h)),
          f"One drive, {one.sensor}", alone),
         ("merged.png", ellipsoids_of_maps(truth.frame, base.tiles, merged), f"{n} vehicles", fleet),
         ("truth.png", true, "Truth", f"world seed {world.seed}"),

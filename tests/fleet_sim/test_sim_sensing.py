@@ -12,7 +12,7 @@ from gnd.fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation
 from gnd.fleet_sim.errors import DriveSimError
 from gnd.fleet_sim.lidar import Lidar
 from gnd.fleet_sim.raycast import Scene
-from gnd.fleet_sim.sensing import Beams, Disturbance, Shots, Weather
+from gnd.fleet_sim.sensing import Beams, Disturbance, SweepShots, Weather
 from gnd.fleet_sim.sensors import VLP16
 from gnd.fleet_sim.shapes import Shape
 from gnd.fleet_sim.street import StreetOptions, street
@@ -42,7 +42,7 @@ def met(world: World, weather: Weather = "clear", beams: Beams = "ideal", t_s: f
     poses = np.tile(T, (VLP16.columns + 1, 1, 1))
     hits = lidar.hits(scene, poses)
     ranges, primitive, incidence = hits.range_m.copy(), hits.primitive.copy(), hits.incidence.copy()
-    shots = Shots(poses[:, :3], VLP16.directions(), VLP16.shares, VLP16.range_max_m)
+    shots = SweepShots(poses[:, :3], VLP16.directions(), VLP16.shares, VLP16.range_max_m)
     disturbance = Disturbance(world, "after", weather, beams, (7, 0))
     disturbance.disturb(scene, scene.packed, shots, t_s, (ranges, primitive, incidence))
     return VLP16.directions(), hits.range_m, ranges, hits.primitive, primitive
@@ -69,7 +69,7 @@ def test_the_plain_twin_of_the_shots_gives_the_rays_that_were_cast() -> None:
     T[:, :3, 3] = EYE_M + np.linspace(0.0, 0.9, len(T))[:, None] * np.array([1.0, 0.1, 0.0])
     hits = Lidar(VLP16).hits(scene, T)
     column, beam = np.nonzero(hits.primitive >= 0)
-    origin, direction = Shots(T[:, :3], VLP16.directions(), VLP16.shares, 100.0).rays(column, beam)
+    origin, direction = SweepShots(T[:, :3], VLP16.directions(), VLP16.shares, 100.0).rays(column, beam)
     for k in range(0, len(column), 4001):
         ranges, _ = scene.cast(origin[k], direction[k : k + 1], 100.0)
         assert ranges[0] == pytest.approx(hits.range_m[column[k], beam[k]], abs=1e-9)
