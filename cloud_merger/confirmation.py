@@ -131,7 +131,7 @@ def gate(
     waits: dict[int, tuple[str, WaitingReason]] = {}
     isolated = _isolated(epoch, merged, by_report.values(), parameters.together_voxels)
     for vehicle, witness in sorted(lonely.items()):
-        seen = _seen(vehicle, epoch, by_report.values())
+        seen = seen_of(vehicle, epoch, by_report.values())
         reasons = _waiting_of(witness, seen, None if len(epoch) == 0 else isolated, parameters)
         if vehicle in named:
             reasons = dict.fromkeys(witness.lonely, "named")
@@ -211,7 +211,7 @@ def _waiting_of(
     return waits | dict.fromkeys(rest & isolated, "isolated")
 
 
-def _seen(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
+def seen_of(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
     """Voxels of the tile that a vehicle observed and that hold something, before or by its word."""
     own = [_seen_by(report.change, epoch) for report in reports if report.vehicle == vehicle]
     if not own:
@@ -244,7 +244,7 @@ def _told(
             vehicle=vehicle,
             report_ids=tuple(sorted({one for voxel in voxels for one in merged.provenance[voxel]})),
             voxels=len(voxels),
-            seen=max(_seen(vehicle, epoch, reports), len(voxels)),  # "as in an older version" claims, too
+            seen=max(seen_of(vehicle, epoch, reports), len(voxels)),  # "as in an older version" claims, too
             reason=reason,
         )
         for (vehicle, reason), voxels in sorted(told.items())

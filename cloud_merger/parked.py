@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from gnd.cloud_merger.confirmation import seen_of
 from gnd.cloud_merger.memory import PARKED, ParkedVoxels
 from gnd.cloud_merger.merge import MergedTile
 from gnd.cloud_merger.statements import Kind, Report, changed_of, find
@@ -90,7 +91,7 @@ def hold_parked(
         return ParkedTile(merged)
     voxels = np.concatenate(held)
     voxels = voxels[np.argsort(voxels["voxel_id"])]
-    return ParkedTile(merged.without(voxels["voxel_id"].tolist()), voxels, _waiting(voxels, merged, reports))
+    return ParkedTile(merged.without(voxels["voxel_id"].tolist()), voxels, _waiting(voxels, merged, epoch, reports))
 
 
 def parked_after(
@@ -184,7 +185,9 @@ def _rows(group: I32, since_ns: int, goings: I64) -> ParkedVoxels:
     return rows
 
 
-def _waiting(voxels: ParkedVoxels, merged: MergedTile, reports: Sequence[Report]) -> tuple[Unconfirmed, ...]:
+def _waiting(
+    voxels: ParkedVoxels, merged: MergedTile, epoch: Gaussians, reports: Sequence[Report]
+) -> tuple[Unconfirmed, ...]:
     """What waits, told of the vehicle whose report about it comes first."""
     vehicle = {one.report_id: one.vehicle for one in reports}
     claims: dict[str, list[tuple[str, ...]]] = {}
@@ -192,9 +195,8 @@ def _waiting(voxels: ParkedVoxels, merged: MergedTile, reports: Sequence[Report]
         ids = merged.provenance[voxel]
         first = min((vehicle[one] for one in ids if one in vehicle), default="")
         claims.setdefault(first, []).append(ids)
-    seen = {name: sum(len(one.change.observed) for one in reports if one.vehicle == name) for name in claims}
     return tuple(
         Unconfirmed(name, tuple(sorted({one for ids in claimed for one in ids})), len(claimed),
-                    max(seen[name], len(claimed)), "parked")
+                    max(seen_of(name, epoch, reports), len(claimed)), "parked")
         for name, claimed in sorted(claims.items())
     )  # fmt: skip

@@ -152,6 +152,11 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles: another vehicle that"
             " finds the same confirms it (`gnd map status`)"
         )
+    if waiting["parked"]:
+        lines.append(
+            f"parked: {waiting['parked']} new voxels have the shape of a standing vehicle: they are published when they"
+            " have stood for long (`confirmation.parked_h`)"
+        )
     lines += [one["says"] for one in summary["named_vehicles"]]
     if p95["longitudinal_m"] is not None:
         lines.append(

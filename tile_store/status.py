@@ -95,10 +95,13 @@ def _doubts_of(store: Store, waiting: WaitingChange) -> list[str]:
 
 
 def waiting_totals(store: Store) -> dict[str, int]:
-    """How many tiles and voxels wait for a second witness; a voxel counts once for each vehicle that claims it."""
-    waiting = store.waiting_changes()
+    """How many tiles and voxels wait for a second witness, and how many voxels for having stood long enough; a voxel
+    counts once for each vehicle that claims it.
+    """
+    waiting = [one for one in store.waiting_changes() if one.reason != "parked"]
+    parked = sum(one.voxels for one in store.waiting_changes() if one.reason == "parked")
     tiles = {(one.layer, one.tile) for one in waiting}
-    return {"tiles": len(tiles), "voxels": sum(one.voxels for one in waiting)}
+    return {"tiles": len(tiles), "voxels": sum(one.voxels for one in waiting), "parked": parked}
 
 
 def named_vehicles(store: Store) -> list[dict[str, Any]]:
@@ -202,6 +205,7 @@ def _aside_table(aside: list[dict[str, Any]]) -> Table:
 def _waiting_table(waiting: dict[str, Any]) -> Table:
     title = (
         f"waiting for confirmation by a second vehicle or drive: {waiting['voxels']} voxels in {waiting['tiles']} tiles"
+        + (f"; parked: {waiting['parked']} voxels" if waiting["parked"] else "")
     )
     table = Table("layer", "tile", "vehicle", "voxels", "of seen", "since (UTC)", "because", title=title)
     for one in waiting["claims"]:

@@ -96,11 +96,11 @@ def test_a_parked_car_is_no_change_however_many_see_it_within_the_hour_and_a_hou
     assert street.waiting() == {"parked"}
 
 
-def test_what_has_the_shape_of_a_car_and_stays_is_published_after_a_day(street):
-    for k, hour in enumerate([0, 0.5, 8, 16, 23.5]):
+def test_what_has_the_shape_of_a_car_and_stays_is_published_after_a_night(street):
+    for k, hour in enumerate([0, 0.5, 8, 14, 17.5]):
         street.sees(f"car-{k}", hour, CAR)
         assert street.holds(CAR) == 0.0
-    street.sees("car-9", 24.5, CAR)
+    street.sees("car-9", 18.5, CAR)
     assert street.holds(CAR) == 1.0
     assert street.waiting() == set()
 

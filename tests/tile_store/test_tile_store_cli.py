@@ -217,7 +217,7 @@ def test_status_of_a_map_that_waits_for_nothing_is_one_line(path: Path) -> None:
         "shards": [],
         "queue": {"tiles": 0, "report_parts": 0, "overdue_s": 0.0, "waiting_s": 0.0},
         "set_aside": [],
-        "waiting_for_confirmation": {"tiles": 0, "voxels": 0, "claims": []},
+        "waiting_for_confirmation": {"tiles": 0, "voxels": 0, "parked": 0, "claims": []},
         "named_vehicles": [],
         "to_merge": [],
         "uploads": {},
