@@ -19,6 +19,7 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import BlindFilter
 from gnd.vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED, NONE, best_identities
+from gnd.vehicle_agent.features.slamcu.sensor_model import OTHER_KIND
 from gnd.vehicle_agent.features.slamcu.track_list import TrackList
 from gnd.vehicle_agent.features.slamcu.tracked_feature import TrackedFeature
 
@@ -130,6 +131,9 @@ class MapComparison:
             return
         xy_m, cov = self._tracks.moments(feature)
         moved = self._is_elsewhere(feature, xy_m, cov)
+        if feature.known and self._is_of_another_kind(feature):
+            self._split(feature, t_ns)
+            return
         if not feature.known:  # found on an earlier passage already
             if moved:
                 self._particles.priors[feature.slot] = None
@@ -148,15 +152,29 @@ class MapComparison:
             before = feature.measured
             feature.measured = (xy_m, cov) if before is None else fused_moments(before, (xy_m, cov))
         self._particles.settle(feature.slot)
+        self._learn(feature)
+
+    def _learn(self, feature: TrackedFeature) -> None:
+        """What a feature that was found in place says about errors that stay with features."""
+        if self._tracks.sensor.learns and feature.slot is not None and feature.pass_hits >= ENOUGH_HITS:
+            errors = self._particles.errors_of(feature.slot, self._particles.weights())
+            self._tracks.sensor.settled(*errors, feature.held)
 
     def _is_elsewhere(self, feature: TrackedFeature, xy_m: F64, cov: F64) -> bool:
         far = float(np.hypot(*(xy_m - feature.xy_m))) > MOVED_M
         return far and innovation_of(feature, xy_m, cov).squared > MOVED_GATE
 
+    def _is_of_another_kind(self, feature: TrackedFeature) -> bool:
+        """Whether nearly all of its detections name a kind that the map does not."""
+        total = sum(feature.named.values())
+        kind, most = feature.named.most_common(1)[0] if total else (feature.kind, 0)
+        return kind != feature.kind and total >= ENOUGH_HITS and most >= OTHER_KIND * total
+
     def _split(self, feature: TrackedFeature, t_ns: int) -> None:
         """A moved feature is a deleted one and a new one (section 2.3)."""
         xy_m, _ = self._tracks.moments(feature)
-        found, hits = self._tracks.register(feature.kind), feature.pass_hits
+        kind = feature.named.most_common(1)[0][0] if feature.named else feature.kind
+        found, hits = self._tracks.register(kind), feature.pass_hits
         found.xy_m, found.in_view_s, found.odometer_m = xy_m, feature.in_view_s, feature.odometer_m
         found.heights, feature.heights = feature.heights, found.heights
         self._tracks.hand_over(feature, found)

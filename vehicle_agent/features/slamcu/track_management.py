@@ -7,6 +7,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.map_comparison import ENOUGH_HITS
+from gnd.vehicle_agent.features.slamcu.sensor_model import LN_SIGN, Tally
 from gnd.vehicle_agent.features.slamcu.track_list import TrackList
 from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, TrackedFeature
 
@@ -20,6 +21,8 @@ SAME_GATE: Final = 9.0
 """Two features within this squared Mahalanobis distance may be one."""
 SAME_M: Final = 4.0
 """And at most so far apart."""
+CONFUSED_SHARE: Final = 0.3
+"""What was measured less often than this share of another feature may be that one, taken for another kind."""
 TOGETHER_SHARE: Final = 0.15
 """Two features that are measured at once in this share of the looks that could are two."""
 
@@ -31,19 +34,32 @@ def remove_false_and_double(tracks: TrackList, near: Sequence[TrackedFeature], t
             tracks.drop(feature)
             continue
         for other in near:
-            if other is not feature and other.kind == feature.kind and _same(tracks, other, feature):
+            if other is not feature and _alike(tracks, other, feature) and _same(tracks, other, feature):
                 _merge(tracks, other, feature, t_ns)
                 break
 
 
 def leave(tracks: TrackList, feature: TrackedFeature, odometer_m: float) -> None:
     """A feature out of view is estimated no longer: the map's at once, a new one when it can learn little more."""
+    learn_of(tracks, feature)
     if feature.known:
         tracks.end(feature)
     elif feature.feature_class != FeatureClass.NEW:
         tracks.drop(feature)
     elif odometer_m - feature.odometer_m > HORIZON_M:
         tracks.freeze(feature)
+
+
+def learn_of(tracks: TrackList, feature: TrackedFeature) -> None:
+    """What a feature that has been passed says of the sensor, and whether a new one is a sign at all."""
+    sensor, tally = tracks.sensor, feature.tally
+    if not sensor.learns or not tally.looks:
+        return
+    if not feature.known and not feature.is_clutter:
+        feature.is_clutter = sensor.ln_sign(tally, feature.named) < LN_SIGN
+    if feature.feature_class in (FeatureClass.NORMAL, FeatureClass.NEW) and feature.hits >= ENOUGH_HITS:
+        sensor.passed(tally, feature.named, feature.kind)
+    feature.tally = Tally()
 
 
 def leave_oldest(tracks: TrackList) -> None:
@@ -65,6 +81,15 @@ def leave_all(tracks: TrackList) -> None:
             tracks.freeze(feature)
         else:
             tracks.drop(feature)
+
+
+def _alike(tracks: TrackList, other: TrackedFeature, feature: TrackedFeature) -> bool:
+    """Whether two features may be of one kind: one was measured so seldom that its kind may have been confused."""
+    if other.kind == feature.kind:
+        return True
+    if not tracks.sensor.learns:
+        return False
+    return min(feature.hits, other.hits) <= CONFUSED_SHARE * max(feature.hits, other.hits)
 
 
 def _same(tracks: TrackList, other: TrackedFeature, feature: TrackedFeature) -> bool:
