@@ -3,12 +3,14 @@ nothing moves by a hair.
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
+from gnd.cloud_merger.features.drive_shift import DriveShift
 from gnd.cloud_merger.features.existence import prior_of, verdict
 from gnd.cloud_merger.features.memory import Own, Vote
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
@@ -94,6 +96,9 @@ class Story:
         self._prior = prior_of(track)
         self.masses = self._prior
         self._state: PlaceEstimate | None = self.known
+        self._shift = DriveShift()
+        if self.known is not None and track.is_point:
+            self._shift.add(self.known)
         self._is_stale = bool(self.measured)
         self._longest_m = max((length_of(place.points_m) for place in self._places()), default=0.0)
         self._least_m2 = {vehicle: self._fused(own).least_m2 for vehicle, own in self.measured.items()}
@@ -166,6 +171,7 @@ class Story:
             self._is_stale = True
         elif not self._is_stale:
             self._state = place if self._state is None else step(self._state, place)
+            self._shift_by([place])
         self._confirm()
         return is_new
 
@@ -192,10 +198,22 @@ class Story:
         return fused(own.place, own.repeats, self._parameters.information_of(own.repeats))
 
     def place(self) -> PlaceEstimate:
-        """The estimate of all vehicles, each with what its measurements say together."""
+        """The estimate of all vehicles, each with what its measurements say together and a shift of its own."""
         if self._is_stale or self._state is None:
-            self._state, self._is_stale = self._estimate(list(self.balanced().values())), False
-        return self._state
+            each = list(self.balanced().values())
+            self._state, self._is_stale = self._estimate(list(each)), False
+            self._shift = DriveShift()
+            self._shift_by(each if self.known is None else [self.known, *each])
+        added_m2 = self._shift.added_m2()
+        if not added_m2.any():
+            return self._state
+        cov = self._state.cov_m2.copy()
+        cov[:2, :2] += added_m2
+        return PlaceEstimate(self._state.points_m, cov)
+
+    def _shift_by(self, places: Iterable[PlaceEstimate]) -> None:
+        for place in places if self.track.is_point else ():
+            self._shift.add(place)
 
     def balanced(self) -> dict[str, PlaceEstimate]:
         """What the measurements of each vehicle say together, and weigh beside those of the others."""

@@ -147,6 +147,7 @@ def test_covariances_stay_honest_over_windows(vehicles, repeats):
         error = got.points_m[0, :2] - truth
         squares.append(error @ np.linalg.solve(full_covariance(got.cov_m2)[:2, :2], error))
         assert vehicles - 1 <= got.vehicles <= vehicles
-        assert got.cov_m2[0] < 1.2 * 0.09 * (1 + 0.5 * (repeats - 1)) / repeats / vehicles
+        # drives that happen to scatter by more than they claim make it a little less sure
+        assert got.cov_m2[0] < 1.6 * 0.09 * (1 + 0.5 * (repeats - 1)) / repeats / vehicles
     low, high = band(RUNS, 2)
     assert low < np.mean(squares) < high

@@ -141,7 +141,7 @@ class MapComparison:
                 self._particles.settle(feature.slot)
             feature.cov = None
             return
-        self.innovations.append(innovation_of(feature, xy_m, cov))
+        self.innovations.append(innovation_of(feature, xy_m, cov * self._tracks.sensor.places))
         if moved and self._is_the_vehicle(feature, xy_m - feature.xy_m):
             self._search_anew(t_ns)  # and settle when the place has been found
         elif moved:
@@ -150,6 +150,8 @@ class MapComparison:
         else:
             self._last_moved, self._in_place_m = None, feature.odometer_m
             before = feature.measured
+            if self._tracks.sensor.learns:
+                self._tracks.sensor.compared(innovation_of(feature, xy_m, cov).squared)
             feature.measured = (xy_m, cov) if before is None else fused_moments(before, (xy_m, cov))
         self._particles.settle(feature.slot)
         self._learn(feature)
@@ -161,8 +163,9 @@ class MapComparison:
             self._tracks.sensor.settled(*errors, feature.held)
 
     def _is_elsewhere(self, feature: TrackedFeature, xy_m: F64, cov: F64) -> bool:
-        far = float(np.hypot(*(xy_m - feature.xy_m))) > MOVED_M
-        return far and innovation_of(feature, xy_m, cov).squared > MOVED_GATE
+        sensor = self._tracks.sensor
+        far = float(np.hypot(*(xy_m - feature.xy_m))) > MOVED_M + sensor.lasting_m
+        return far and innovation_of(feature, xy_m, cov * sensor.places).squared > MOVED_GATE
 
     def _is_of_another_kind(self, feature: TrackedFeature) -> bool:
         """Whether nearly all of its detections name a kind that the map does not."""

@@ -35,6 +35,11 @@ SURE_HITS: Final = 10
 """And from then on its innovations are those of the white noise."""
 MEMORY: Final = 600.0
 """White noise is judged by the last so many measurements."""
+PLACES: Final = 120.0
+"""And places by the last so many comparisons with the map, two a feature."""
+MOST_SQUARED: Final = 20.0
+"""A feature farther off than this has moved, or is another one."""
+TYPICAL_M: Final = 30.0
 CONFUSED: Final = (0.002, 0.2)
 """Bounds of the share of detections that name another kind."""
 KINDS: Final = 6.0
@@ -107,13 +112,14 @@ class SensorModel:
         self.confidence, self.learns = confidence, learns
         self._held = (ScaleBelief(0.03, 0.8, 0.002, 0.15), ScaleBelief(radians(0.6), 0.8, radians(0.05), radians(4.0)))
         self._white = (ScaleBelief(1.0, 0.3, 0.5, 4.0), ScaleBelief(1.0, 0.3, 0.5, 4.0))
+        self._places = ScaleBelief(1.0, 0.3, 1.0, 3.0)
         self._seen = Tally()
         self._named = np.array([1.0, 30.0])  # detections of another kind, and of the feature's own
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "SensorModel":
         copied = SensorModel(self.confidence, learns=self.learns)
         memo[id(self)] = copied
-        for name in ("_held", "_white", "_seen", "_named"):
+        for name in ("_held", "_white", "_places", "_seen", "_named"):
             setattr(copied, name, deepcopy(getattr(self, name), memo))
         return copied
 
@@ -126,6 +132,21 @@ class SensorModel:
     def white(self) -> F64:
         """(2,) what the stated variances of range and bearing are multiplied by."""
         return np.square([one.value for one in self._white]) if self.learns else np.ones(2)
+
+    @property
+    def places(self) -> float:
+        """What variances of places are multiplied by, as innovations against the map show; 1 or more."""
+        return self._places.value**2 if self.learns else 1.0
+
+    @property
+    def lasting_m(self) -> float:
+        """How far off a feature may seem by what stays with it: twice the error of its range, where most are seen."""
+        return 2.0 * float(np.sqrt(self.held[0])) * TYPICAL_M
+
+    def compared(self, squared: float) -> None:
+        """A feature of the map was measured so far off (squared Mahalanobis distance, 2 degrees of freedom)."""
+        for _ in range(2):
+            self._places.add(float(np.sqrt(0.5 * min(squared, MOST_SQUARED))), 0.0, 1.0 / PLACES)
 
     def detects(self, range_m: float) -> float:
         """The share of looks that detect a feature at a range, within `DETECTED`."""
@@ -189,9 +210,9 @@ class SensorModel:
         looks = float(sum(tally.looks.values()))
         hits = float(sum(tally.hits.values()))
         expected = sum(count * self.detects((bin_ + 0.5) * BIN_M) for bin_, count in tally.looks.items())
-        if not self.learns or expected < 3.0:
+        if not self.learns:
             return 0.0
-        usual = min(max(expected / looks, 0.05), 0.95)
+        usual = float(np.clip(expected / max(looks, 1.0), 0.05, 0.95))
         rate = _ln_rate(hits, looks, SIGN_RATE, usual) - _ln_rate(hits, looks, CLUTTER_RATE, usual)
         total, top = float(sum(named.values())), float(max(named.values(), default=0))
         kinds = betaln(1.0 + total - top, 15.0 + top) - betaln(1.0, 15.0)
@@ -204,8 +225,8 @@ CLUTTER_RATE: Final = (0.02, 0.75)
 """Signs and what looks like them are detected in these shares of the looks that usually detect a sign."""
 MOST_LN: Final = 6.0
 """Neither rate nor kinds alone say more than this."""
-LN_SIGN: Final = -0.7
-"""A new feature that is less likely a sign than this (natural logarithm) is none: two to one."""
+LN_SIGN: Final = 0.2
+"""A new feature that is less likely a sign than this (natural logarithm) is not reported."""
 
 
 def _ln_rate(hits: float, looks: float, between: tuple[float, float], usual: float) -> float:

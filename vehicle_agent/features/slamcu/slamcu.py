@@ -23,7 +23,7 @@ from gnd.vehicle_agent.features.slamcu.map_comparison import MapComparison, MapI
 from gnd.vehicle_agent.features.slamcu.noise import GNSS_INTERVAL_S
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
-from gnd.vehicle_agent.features.slamcu.sensor_model import CALIBRATION, SURE_HITS, SensorModel
+from gnd.vehicle_agent.features.slamcu.sensor_model import CALIBRATION, SURE_HITS, WRONG, SensorModel
 from gnd.vehicle_agent.features.slamcu.track_list import TrackList
 from gnd.vehicle_agent.features.slamcu.track_management import leave, leave_all, leave_oldest, remove_false_and_double
 from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, TrackedFeature, add_evidence, existence_of
@@ -204,6 +204,12 @@ class Slamcu:
     def camera(self) -> tuple[F64, F64]:
         """Errors of the camera: mean (2,) and covariance (2, 2) of the share of ranges, and of the bearing [rad]."""
         return self._particles.calibration()
+
+    @property
+    def camera_is_wrong(self) -> bool:
+        """Whether the camera is surely farther off than a camera may be mounted: `WRONG`."""
+        mean, cov = self.camera
+        return bool((np.abs(mean) - 2.0 * np.sqrt(np.diag(cov)) > WRONG).any())
 
     @property
     def has_fixes(self) -> bool:
@@ -391,7 +397,7 @@ class Slamcu:
 
     def _noted(self, feature: TrackedFeature, look: Look, row: int, weights: F64) -> None:
         feature.in_view_s, feature.odometer_m = self.now_s, self.odometer_m
-        feature.pass_hits += 1
+        feature.pass_hits, feature.is_passed = feature.pass_hits + 1, False
         feature.named[look.kinds[row]] += 1
         if not feature.known:
             feature.kind = feature.named.most_common(1)[0][0]
@@ -416,7 +422,7 @@ class Slamcu:
         seen = feature.measured
         if seen is None and self._tracks.awaits_map(feature):
             seen = self._tracks.moments(feature)
-        xy_m, cov = seen if seen is not None else (None, None)
+        xy_m, cov = (seen[0], seen[1] * self.sensor.places) if seen is not None else (None, None)
         return KnownState(
             feature.number, feature.feature_class, existence_of(feature.masses), feature.hits, feature.misses,
             xy_m, cov, feature.height_m, feature.masses_over_time(),
@@ -429,7 +435,7 @@ class Slamcu:
             assert feature.cov is not None
             xy_m, cov = feature.xy_m, feature.cov[[0, 1, 1, 2]].reshape(2, 2)
         return NewFeature(
-            feature.number, feature.kind, xy_m, cov, feature.height_m, feature.feature_class,
+            feature.number, feature.kind, xy_m, cov * self.sensor.places, feature.height_m, feature.feature_class,
             existence_of(feature.masses), feature.hits, feature.misses, feature.masses_over_time(),
         )  # fmt: skip
 

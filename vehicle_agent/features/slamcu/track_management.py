@@ -53,8 +53,9 @@ def leave(tracks: TrackList, feature: TrackedFeature, odometer_m: float) -> None
 def learn_of(tracks: TrackList, feature: TrackedFeature) -> None:
     """What a feature that has been passed says of the sensor, and whether a new one is a sign at all."""
     sensor, tally = tracks.sensor, feature.tally
-    if not sensor.learns or not tally.looks:
+    if not sensor.learns or feature.is_passed:
         return
+    feature.is_passed = True
     if not feature.known and not feature.is_clutter:
         feature.is_clutter = sensor.ln_sign(tally, feature.named) < LN_SIGN
     if feature.feature_class in (FeatureClass.NORMAL, FeatureClass.NEW) and feature.hits >= ENOUGH_HITS:

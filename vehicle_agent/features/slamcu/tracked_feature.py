@@ -78,6 +78,7 @@ class TrackedFeature:
         named: how often it was measured as which kind.
         tally: looks at it that were well in view, by range.
         held: (2,) variances of the errors that stay with it, before it was estimated.
+        is_passed: whether it has been out of view since it was last measured.
         is_clutter: its detections are those of something that is taken for a sign now and then.
     """
 
@@ -102,6 +103,7 @@ class TrackedFeature:
     named: Counter[str] = field(default_factory=Counter)
     tally: Tally = field(default_factory=Tally)
     held: F64 = field(default_factory=lambda: np.zeros(2))
+    is_passed: bool = False
     is_clutter: bool = False
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "TrackedFeature":

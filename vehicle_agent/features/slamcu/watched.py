@@ -41,7 +41,7 @@ from gnd.vehicle_agent.features.slamcu.replay import (
     SlamcuEvent,
     WatchedRun,
 )
-from gnd.vehicle_agent.features.slamcu.sensor_model import WRONG, SensorModel
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
@@ -232,9 +232,8 @@ class WatchedSlamcu:
 
     @property
     def camera_is_wrong(self) -> bool:
-        """Whether the camera is surely farther off than a camera may be mounted: `WRONG`."""
-        mean, cov = self.camera
-        return bool((np.abs(mean) - 2.0 * np.sqrt(np.diag(cov)) > WRONG).any())
+        """As of `Slamcu`."""
+        return self._slamcu.camera_is_wrong
 
     @property
     def is_lost(self) -> bool:
