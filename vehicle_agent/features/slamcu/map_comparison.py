@@ -33,6 +33,8 @@ ENOUGH_HITS: Final = 6
 """So many measurements show where a feature is, and whether it is ever measured together with another."""
 GROUP_M: Final = 12.0
 """Features within this distance may be taken for each other: three lanes."""
+WIDE_GROUP_M: Final = 20.0
+"""The same where errors stay with features: along the road they may be many metres."""
 RIVAL_SHARE: Final = 0.25
 """What was measured less often than this share of what stands beside it is no feature of the map that was in view."""
 SURE: Final = 3.0
@@ -163,9 +165,12 @@ class MapComparison:
             self._tracks.sensor.settled(*errors, feature.held)
 
     def _is_elsewhere(self, feature: TrackedFeature, xy_m: F64, cov: F64) -> bool:
-        sensor = self._tracks.sensor
-        far = float(np.hypot(*(xy_m - feature.xy_m))) > MOVED_M + sensor.lasting_m
-        return far and innovation_of(feature, xy_m, cov * sensor.places).squared > MOVED_GATE
+        sensor, far = self._tracks.sensor, float(np.hypot(*(xy_m - feature.xy_m))) > MOVED_M
+        if not far or not sensor.learns:
+            return far and innovation_of(feature, xy_m, cov).squared > MOVED_GATE
+        pose, _ = self._particles.pose(self._particles.weights())
+        wide = cov * sensor.places + sensor.lasting(float(pose[2]))
+        return innovation_of(feature, xy_m, wide).squared > MOVED_GATE
 
     def _is_of_another_kind(self, feature: TrackedFeature) -> bool:
         """Whether nearly all of its detections name a kind that the map does not."""
@@ -215,11 +220,12 @@ class MapComparison:
     def _group(self, feature: TrackedFeature) -> list[TrackedFeature]:
         """Features like this one around it that are being estimated, those of the map that await comparison first."""
         here = self._particles.mu[feature.estimated_in].mean(axis=0)
+        reach_m = WIDE_GROUP_M if self._tracks.sensor.learns else GROUP_M
         alike = [
             one
             for one in self._tracks.live
             if one.kind == feature.kind
-            and float(np.hypot(*(self._particles.mu[one.estimated_in].mean(axis=0) - here))) < GROUP_M
+            and float(np.hypot(*(self._particles.mu[one.estimated_in].mean(axis=0) - here))) < reach_m
         ]
         unsettled = [one for one in alike if one.known and self._tracks.awaits_map(one)]
         most = max(one.pass_hits for one in alike)

@@ -40,6 +40,7 @@ PLACES: Final = 120.0
 MOST_SQUARED: Final = 20.0
 """A feature farther off than this has moved, or is another one."""
 TYPICAL_M: Final = 30.0
+"""A feature is judged by looks from about so far."""
 CONFUSED: Final = (0.002, 0.2)
 """Bounds of the share of detections that name another kind."""
 KINDS: Final = 6.0
@@ -138,11 +139,6 @@ class SensorModel:
         """What variances of places are multiplied by, as innovations against the map show; 1 or more."""
         return self._places.value**2 if self.learns else 1.0
 
-    @property
-    def lasting_m(self) -> float:
-        """How far off a feature may seem by what stays with it: twice the error of its range, where most are seen."""
-        return 2.0 * float(np.sqrt(self.held[0])) * TYPICAL_M
-
     def compared(self, squared: float) -> None:
         """A feature of the map was measured so far off (squared Mahalanobis distance, 2 degrees of freedom)."""
         for _ in range(2):
@@ -155,6 +151,12 @@ class SensorModel:
         bin_ = int(range_m / BIN_M)
         share = (self._seen.hits[bin_] + self.confidence * BEFORE) / (self._seen.looks[bin_] + BEFORE)
         return float(np.clip(share, *DETECTED))
+
+    def lasting(self, heading_rad: float) -> F64:
+        """(2, 2) covariance of what stays with a feature although its looks do not show it: half of its sigmas."""
+        c, s = np.cos(heading_rad), np.sin(heading_rad)
+        R = np.array([[c, -s], [s, c]])
+        return np.asarray(R @ np.diag(0.25 * self.held * TYPICAL_M**2) @ R.T)
 
     def miss(self, range_m: float) -> float:
         """What a look without the feature at this range counts, in misses of Eq. (2). Its λ is the share of looks that
@@ -215,7 +217,9 @@ class SensorModel:
         usual = float(np.clip(expected / max(looks, 1.0), 0.05, 0.95))
         rate = _ln_rate(hits, looks, SIGN_RATE, usual) - _ln_rate(hits, looks, CLUTTER_RATE, usual)
         total, top = float(sum(named.values())), float(max(named.values(), default=0))
-        kinds = betaln(1.0 + total - top, 15.0 + top) - betaln(1.0, 15.0)
+        usual_sign = betaln(1.0 + total - top, 15.0 + top) - betaln(1.0, 15.0)
+        confused = betaln(4.0 + total - top, 6.0 + top) - betaln(4.0, 6.0)
+        kinds = np.logaddexp(log(1.0 - ALWAYS_CONFUSED) + usual_sign, log(ALWAYS_CONFUSED) + confused)
         kinds -= betaln(1.5 + total - top, 2.5 + top) - betaln(1.5, 2.5)
         return float(np.clip(rate, -MOST_LN, MOST_LN) + np.clip(kinds, -MOST_LN, MOST_LN))
 
@@ -223,9 +227,11 @@ class SensorModel:
 SIGN_RATE: Final = (0.65, 1.05)
 CLUTTER_RATE: Final = (0.02, 0.75)
 """Signs and what looks like them are detected in these shares of the looks that usually detect a sign."""
+ALWAYS_CONFUSED: Final = 0.07
+"""Share of signs that a drive takes for another kind again and again."""
 MOST_LN: Final = 6.0
 """Neither rate nor kinds alone say more than this."""
-LN_SIGN: Final = 0.2
+LN_SIGN: Final = 0.5
 """A new feature that is less likely a sign than this (natural logarithm) is not reported."""
 
 

@@ -47,6 +47,9 @@ NEAR_M: Final = 30.0
 """Features so much farther than the view's range cannot be what was measured."""
 TOGETHER_S: Final = 0.1
 """Samples of wheels and gyro are put together for at most so long."""
+KNOWN_MISS: Final = 0.5
+"""A look in which a feature of the map is not seen counts so much, on a vehicle that learns how its camera errs: what
+hides or confuses a sign does so in many looks. A sign that is gone is not seen in any."""
 LEAST_PLAUSIBLE: Final = 1e-3
 """A feature that surely is not there competes for measurements with this share of its likelihood."""
 
@@ -373,7 +376,12 @@ class Slamcu:
         for i, hit in zip(rows, is_measured, strict=True):
             near[i].tally.count(float(ahead.z[i, 0]), hit=bool(hit))
         rows = rows[~is_measured]
-        return [near[i] for i in rows], [self.sensor.miss(float(ahead.z[i, 0])) for i in rows]
+        return [near[i] for i in rows], [self._count_of_a_miss(near[i], float(ahead.z[i, 0])) for i in rows]
+
+    def _count_of_a_miss(self, feature: TrackedFeature, range_m: float) -> float:
+        """What a look counts in which a feature was not seen."""
+        count = self.sensor.miss(range_m)
+        return count * KNOWN_MISS if feature.known and self.sensor.learns else count
 
     def _measure(self, look: Look, rows: I64, detected: list[TrackedFeature], weights: F64) -> None:
         """Section 4.3.4: features that exist are measured; Eq. (16) to (19)."""

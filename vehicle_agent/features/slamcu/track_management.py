@@ -21,8 +21,6 @@ SAME_GATE: Final = 9.0
 """Two features within this squared Mahalanobis distance may be one."""
 SAME_M: Final = 4.0
 """And at most so far apart."""
-CONFUSED_SHARE: Final = 0.3
-"""What was measured less often than this share of another feature may be that one, taken for another kind."""
 TOGETHER_SHARE: Final = 0.15
 """Two features that are measured at once in this share of the looks that could are two."""
 
@@ -34,7 +32,8 @@ def remove_false_and_double(tracks: TrackList, near: Sequence[TrackedFeature], t
             tracks.drop(feature)
             continue
         for other in near:
-            if other is not feature and _alike(tracks, other, feature) and _same(tracks, other, feature):
+            alike = other.kind == feature.kind or tracks.sensor.learns  # else its kind may have been confused
+            if other is not feature and alike and _same(tracks, other, feature):
                 _merge(tracks, other, feature, t_ns)
                 break
 
@@ -84,21 +83,13 @@ def leave_all(tracks: TrackList) -> None:
             tracks.drop(feature)
 
 
-def _alike(tracks: TrackList, other: TrackedFeature, feature: TrackedFeature) -> bool:
-    """Whether two features may be of one kind: one was measured so seldom that its kind may have been confused."""
-    if other.kind == feature.kind:
-        return True
-    if not tracks.sensor.learns:
-        return False
-    return min(feature.hits, other.hits) <= CONFUSED_SHARE * max(feature.hits, other.hits)
-
-
 def _same(tracks: TrackList, other: TrackedFeature, feature: TrackedFeature) -> bool:
     """Whether a new feature is another one: at one place, and never measured at once."""
     if feature.slot is None or (not other.known and (other.slot is None or other.number > feature.number)):
         return False
     hits = min(feature.hits, max(other.pass_hits, 1))
-    if feature.hits + other.pass_hits < ENOUGH_HITS or feature.together[other.key] > TOGETHER_SHARE * hits:
+    apart = TOGETHER_SHARE * hits if not tracks.sensor.learns else max(TOGETHER_SHARE * hits, 1)
+    if feature.hits + other.pass_hits < ENOUGH_HITS or feature.together[other.key] > apart:
         return False
     off, cov = _apart(tracks, other, feature)
     return float(np.hypot(*off)) < SAME_M and float(off @ np.linalg.solve(cov, off)) < SAME_GATE
@@ -124,5 +115,7 @@ def _merge(tracks: TrackList, kept: TrackedFeature, other: TrackedFeature, t_ns:
     kept.in_view_s = max(kept.in_view_s, other.in_view_s)
     kept.odometer_m = max(kept.odometer_m, other.odometer_m)
     kept.heights += other.heights
+    if kept.named and not kept.known:
+        kept.kind = kept.named.most_common(1)[0][0]
     tracks.recount(kept, hits, max(kept.misses - other.hits, 0), t_ns)
     tracks.drop(other)
