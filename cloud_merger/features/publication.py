@@ -199,17 +199,21 @@ class Story:
 
     def place(self) -> PlaceEstimate:
         """The estimate of all vehicles, each with what its measurements say together and a shift of its own."""
+        state, added_m2 = self._unshifted(), self._shift.added_m2()
+        if not added_m2.any():
+            return state
+        cov = state.cov_m2.copy()
+        cov[:2, :2] += added_m2
+        return PlaceEstimate(state.points_m, cov)
+
+    def _unshifted(self) -> PlaceEstimate:
+        """The same, if each drive's covariance were all that it is off by."""
         if self._is_stale or self._state is None:
             each = list(self.balanced().values())
             self._state, self._is_stale = self._estimate(list(each)), False
             self._shift = DriveShift()
             self._shift_by(each if self.known is None else [self.known, *each])
-        added_m2 = self._shift.added_m2()
-        if not added_m2.any():
-            return self._state
-        cov = self._state.cov_m2.copy()
-        cov[:2, :2] += added_m2
-        return PlaceEstimate(self._state.points_m, cov)
+        return self._state
 
     def _shift_by(self, places: Iterable[PlaceEstimate]) -> None:
         for place in places if self.track.is_point else ():
@@ -269,11 +273,14 @@ class Story:
             self.shown = replace(shown, existence=self.masses)
 
     def _is_worth_it(self, shown: Feature) -> bool:
-        """Whether the estimate is surer than the published one by the gain, or farther from it than its sigma."""
+        """Whether the estimate is surer than the published one by the gain, or less sure, or farther from it than its
+        sigma.
+        """
         place, was = self.place(), full_covariance(shown.cov_m2)
         gain = self._parameters.renewal_gain
         before, after = (np.minimum(np.diag(cov), HEIGHT_KNOWN_M2) for cov in (was, place.cov_m2))
-        if gain == 1.0 or (before >= gain * after * (1 - 1e-9)).any():
+        without_shift = np.minimum(np.diag(self._unshifted().cov_m2), HEIGHT_KNOWN_M2)
+        if gain == 1.0 or (before >= gain * without_shift * (1 - 1e-9)).any() or (after > gain * before).any():
             return True
         if len(place.points_m) != len(shown.points_m):
             return True
