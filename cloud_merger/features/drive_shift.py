@@ -23,17 +23,19 @@ class DriveShift:
     def __init__(self) -> None:
         self._n = 0
         self._W, self._WW = np.zeros((2, 2)), np.zeros((2, 2))
-        self._Wy, self._yWy = np.zeros(2), 0.0
+        self._Wy, self._yWy, self._trace = np.zeros(2), 0.0, 0.0
         self._first = np.zeros(2)
 
-    def add(self, place: PlaceEstimate) -> None:
-        """One more drive's measurement of a point."""
+    def add(self, place: PlaceEstimate, drives: int = 1) -> None:
+        """One more measurement of a point: a drive's, or what so many drives together have left of theirs, whose shifts
+        have averaged out by as much.
+        """
         W, y = np.linalg.inv(place.cov_m2[:2, :2]), place.points_m[0, :2]
         if not self._n:
             self._first = y.copy()  # differences of near places: no digits are lost in squares
         y = y - self._first
         self._n += 1
-        self._W, self._WW = self._W + W, self._WW + W @ W
+        self._W, self._WW, self._trace = self._W + W, self._WW + W @ W / drives, self._trace + np.trace(W) / drives
         self._Wy, self._yWy = self._Wy + W @ y, self._yWy + float(y @ W @ y)
 
     @property
@@ -43,7 +45,7 @@ class DriveShift:
             return 0.0
         C, free = np.linalg.inv(self._W), 2.0 * (self._n - 1)
         scatter = self._yWy - float(self._Wy @ C @ self._Wy)
-        spent = float(np.trace(self._W) - np.trace(C @ self._WW))
+        spent = float(self._trace - np.trace(C @ self._WW))
         return max(scatter - free, 0.0) / max(spent, 1e-12) * free / (free + DOUBTED_FROM)
 
     def added_m2(self) -> F64:

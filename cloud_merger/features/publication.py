@@ -98,7 +98,7 @@ class Story:
         self._state: PlaceEstimate | None = self.known
         self._shift = DriveShift()
         if self.known is not None and track.is_point:
-            self._shift.add(self.known)
+            self._shift.add(self.known, self._known_drives)
         self._is_stale = bool(self.measured)
         self._longest_m = max((length_of(place.points_m) for place in self._places()), default=0.0)
         self._least_m2 = {vehicle: self._fused(own).least_m2 for vehicle, own in self.measured.items()}
@@ -212,8 +212,16 @@ class Story:
             each = list(self.balanced().values())
             self._state, self._is_stale = self._estimate(list(each)), False
             self._shift = DriveShift()
-            self._shift_by(each if self.known is None else [self.known, *each])
+            if self.known is not None and self.track.is_point:
+                self._shift.add(self.known, self._known_drives)
+            self._shift_by(each)
         return self._state
+
+    @property
+    def _known_drives(self) -> int:
+        """How many vehicles' measurements what is known already holds."""
+        epoch = self.track.epoch
+        return max(self.vehicles_before + (0 if epoch is None else epoch.vehicles), 1)
 
     def _shift_by(self, places: Iterable[PlaceEstimate]) -> None:
         for place in places if self.track.is_point else ():
