@@ -17,7 +17,7 @@ from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
 from gnd.vehicle_agent.features.layer_parameters import slamcu_of, view_of
 from gnd.vehicle_agent.features.look import Look, MapFeatures
-from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
+from gnd.vehicle_agent.features.slamcu.sensor_model import HELD_AT_KNOWN_POSES, SensorModel
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
@@ -64,7 +64,9 @@ class FeatureLayer:
         slamcu: Slamcu | WatchedSlamcu | None = None,
     ) -> None:
         self.parameters, self._frame, self._view = parameters, frame, view_of(parameters)
-        sensor = SensorModel(parameters.detection_confidence, learns=parameters.sensor == "camera")
+        sensor = SensorModel(
+            parameters.detection_confidence, learns=parameters.sensor == "camera", held=HELD_AT_KNOWN_POSES
+        )
         self._slamcu = slamcu or Slamcu(
             slamcu_of(parameters), MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4, sensor=sensor
         )

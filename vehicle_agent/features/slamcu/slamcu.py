@@ -186,6 +186,7 @@ class Slamcu:
         self.z_m = z_m
         self._moved = np.zeros(3)
         self._particles.weighing = False
+        self._particles.camera = np.zeros((2, self._particles.m))  # nothing would weigh the particles by it
         self._particles.place(pose, cov)
 
     def pose(self) -> tuple[F64, F64]:
