@@ -17,7 +17,7 @@ from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
 from gnd.vehicle_agent.features.layer_parameters import slamcu_of, view_of
 from gnd.vehicle_agent.features.look import Look, MapFeatures
-from gnd.vehicle_agent.features.slamcu.sensor_model import HELD_AT_KNOWN_POSES, SensorModel
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu

@@ -25,10 +25,11 @@ DETECTED: Final = (0.3, 0.95)
 """Bounds of the share of looks that detect a feature."""
 BEFORE: Final = 20.0
 """The share before any look counts as so many looks."""
-HELD: Final = (0.03, radians(0.6))
-HELD_AT_KNOWN_POSES: Final = (0.005, radians(0.1))
-"""Errors of range (share) and bearing [rad] that stay with a feature, before any was measured. Where poses are known
-otherwise the first sign of the map shows them; where signs find the poses, it is too late then."""
+HELD: Final = (0.008, radians(0.15))
+"""Errors of range (share) and bearing [rad] that stay with a feature, before any was measured: small, or a sign that was
+replaced by one beside it seems to be the same. The first signs that stand where the map has them show what they are."""
+HELD_SPREAD: Final = 1.3
+"""Standard deviation of their natural logarithm."""
 CALIBRATION: Final = np.array([0.03, radians(1.0)])
 """Sigmas of the camera's errors before anything was measured: share of the range, bearing [rad]."""
 WRONG: Final = np.array([0.15, radians(3.0)])
@@ -111,13 +112,15 @@ class SensorModel:
     Args:
         confidence: λ of Eq. (1) and (2), the share of looks that detect a feature before anything was learnt.
         learns: from what it measures.
-        held: sigmas of the errors of range (share) and bearing [rad] that stay with a feature, before any was measured.
     """
 
-    def __init__(self, confidence: float, *, learns: bool = True, held: tuple[float, float] = HELD) -> None:
+    def __init__(self, confidence: float, *, learns: bool = True) -> None:
         self.confidence, self.learns = confidence, learns
-        share, turn = held
-        self._held = (ScaleBelief(share, 0.8, 0.002, 0.15), ScaleBelief(turn, 0.8, radians(0.05), radians(4.0)))
+        share, turn = HELD
+        self._held = (
+            ScaleBelief(share, HELD_SPREAD, 0.002, 0.15),
+            ScaleBelief(turn, HELD_SPREAD, radians(0.05), radians(4.0)),
+        )
         self._white = (ScaleBelief(1.0, 0.3, 0.5, 4.0), ScaleBelief(1.0, 0.3, 0.5, 4.0))
         self._places = ScaleBelief(1.0, 0.3, 1.0, 3.0)
         self._seen = Tally()
