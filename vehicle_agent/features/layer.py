@@ -64,9 +64,7 @@ class FeatureLayer:
         slamcu: Slamcu | WatchedSlamcu | None = None,
     ) -> None:
         self.parameters, self._frame, self._view = parameters, frame, view_of(parameters)
-        sensor = SensorModel(
-            parameters.detection_confidence, learns=parameters.sensor == "camera", held=HELD_AT_KNOWN_POSES
-        )
+        sensor = SensorModel(parameters.detection_confidence, learns=parameters.sensor == "camera")
         self._slamcu = slamcu or Slamcu(
             slamcu_of(parameters), MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4, sensor=sensor
         )

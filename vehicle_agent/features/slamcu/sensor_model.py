@@ -26,8 +26,8 @@ DETECTED: Final = (0.3, 0.95)
 BEFORE: Final = 20.0
 """The share before any look counts as so many looks."""
 HELD: Final = (0.008, radians(0.15))
-"""Errors of range (share) and bearing [rad] that stay with a feature, before any was measured: small, or a sign that was
-replaced by one beside it seems to be the same. The first signs that stand where the map has them show what they are."""
+"""Errors of range (share) and bearing [rad] that stay with a feature, before any was measured: small, or a sign that
+was replaced by one beside it seems to be the same. The first signs that stand as mapped show what they are."""
 HELD_SPREAD: Final = 1.3
 """Standard deviation of their natural logarithm."""
 CALIBRATION: Final = np.array([0.03, radians(1.0)])
