@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +15,7 @@ import click
 from rich.console import Console
 
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
+from gnd.deploy.next_commands import after_fleet
 from gnd.deploy.ports import claim_port
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from gnd.deploy.site import SiteFrame
@@ -59,7 +61,7 @@ RUN_OPTIONS = (
         callback=given,
         help="VEHICLE:DEGREES, such as 3:0.5: its drive contains a LiDAR mount turned by this angle; repeatable.",
     ),
-    click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders), not simulated ones."),
+    click.option("--drives", type=PATH, multiple=True, help="Drives (MCAP, folders) or recordings (KITTI, ...)."),
     click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`)."),
     click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs."),
     click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]"),
@@ -86,10 +88,14 @@ def run_options(command: _Command) -> _Command:
 @click.option("--agents", type=int, help="Vehicle agent processes.  [default: 8, or one a drive with --drives]")
 @click.option("--link", help="Link of every vehicle: 3g, 4g, 5g, none, or a TOML file.  [default: 4g]")
 @click.option("--port", type=int, help="Port of the router; 0 takes a free one.  [default: 0]")
+@click.option(
+    "--made-up", type=click.IntRange(min=0), default=0, help="Made-up boxes to put into the scans of --drives."
+)
 @run_options
 def fleet(
     drives: tuple[Path, ...],
     base_map: Path | None,
+    made_up: int,
     worlds: Path | None,
     out: Path | None,
     overwrite: bool,
@@ -111,14 +117,27 @@ def fleet(
         click.echo(settings_text(config), nl=False)
         return
     need_all()
-    source = Source(drives, base_map, worlds, options["agents"])
+    source = Source(drives, base_map, worlds, options["agents"], made_up)
     load_link(config.link)  # what cannot work is refused before anything is written
     claim_port(config.port)
     folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
     write_settings(config, folder.root)
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
+    source = _imported(source, folder, quiet=as_json)
     summary = run(config, folder, source, keep_drives=keep_drives)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
+    if base_map is not None and not as_json:
+        for line in after_fleet(summary, base_map, folder):
+            click.echo(line)
+
+
+def _imported(source: Source, folder: RunFolder, *, quiet: bool) -> Source:
+    """Recordings among the drives become drives, which stay with the run."""
+    if not source.drives:
+        return source
+    from gnd.deploy.recordings import drives_of
+
+    return dataclasses.replace(source, drives=drives_of(source.drives, folder.imported, partial(click.echo, err=quiet)))
 
 
 def by_part(options: dict[str, Any]) -> dict[str, Any]:

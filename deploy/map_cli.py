@@ -1,5 +1,6 @@
 """`gnd map`: the commands of the store, and `build`, which needs the vehicle's segmentation and localisation."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from gnd.deploy.map_export.command import diff, export
+from gnd.deploy.map_export.serve import serve
 from gnd.deploy.tile_memory_cli import memory
 from gnd.deploy.vehicle_rollback_cli import rollback
 from gnd.deploy.verify_cli import verify
@@ -43,7 +45,8 @@ def build(
     layer: str,
     as_json: bool,
 ) -> None:
-    """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base.
+    """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base. Recordings (KITTI,
+    bags of ROS 2, ...) are imported first.
 
     What moves and the vehicle's own bodywork are left out. Where a place is passed twice and the passes disagree, as
     poses from odometry do, loops are closed first; several drives become one map. What is out of bounds is said.
@@ -51,12 +54,15 @@ def build(
     # loaded here: they load numba, gtsam and matplotlib, which the other commands do without
     from gnd.deploy.html_page import check_writable
     from gnd.deploy.map_page import write_map_page
+    from gnd.deploy.next_commands import after_map_build
+    from gnd.deploy.recordings import drives_of
     from gnd.vehicle_agent.map_build.build import build_recorded_map
     from gnd.vehicle_agent.map_build.quality import measure
     from gnd.vehicle_agent.map_build.result import summary
 
     if report is not None:
         check_writable(report)
+    drives = drives_of(drives, path.with_name(f"{path.stem}_drives"), partial(click.echo, err=as_json))
     with store_to_fill(path) as opened, _bars() as bars:
         built = build_recorded_map(
             drives, opened, layer=layer, codec=codec, keep_movers=keep_movers, refine=refine, progress=_Shown(bars)
@@ -69,7 +75,8 @@ def build(
     if report is not None and not as_json:
         click.echo(f"page written: {report}")
     if not as_json:
-        click.echo(f"next: gnd fleet --drives FOLDER --map {path} with later drives: they heal it")
+        for line in after_map_build(drives, path):
+            click.echo(line)
 
 
 def _print(console: Console, title: str, values: dict[str, Any]) -> None:
@@ -111,9 +118,9 @@ def _bars() -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
 
 
-_COMMANDS = {**store_group.commands, "rollback": rollback, "export": export, "diff": diff}
+_COMMANDS = {**store_group.commands, "rollback": rollback, "export": export, "serve": serve, "diff": diff}
 map_group = click.Group(
     "map",
     commands=[build, align, verify, memory, *_COMMANDS.values()],
-    help="Build, align, inspect, compare, export, verify and roll back maps.",
+    help="Build, align, inspect, compare, export, serve, verify and roll back maps.",
 )

@@ -14,6 +14,7 @@ from rich.progress import Progress, TaskID
 from gnd.deploy.errors import DeployError
 from gnd.deploy.features import put_base_layers
 from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.made_up import MadeUp, with_made_up_boxes
 from gnd.deploy.mounts import with_wrong_mounts
 from gnd.deploy.run_folder import RunFolder
 from gnd.deploy.source import Source
@@ -32,12 +33,14 @@ class PreparedRun:
         truth: the truth of a simulated world, None for recorded drives.
         starts_s: when each starts, in a time that is common to all; empty: each drives in a time of its own.
         world: the simulated world itself, None for recorded drives.
+        made_up: boxes that were put into the recorded drives, None where none were.
     """
 
     agent_drives: tuple[Path, ...]
     truth: Path | None
     starts_s: tuple[float, ...] = ()
     world: Path | None = None
+    made_up: MadeUp | None = None
 
 
 def prepare(config: FleetConfig, folder: RunFolder, source: Source, progress: Progress) -> PreparedRun:
@@ -46,6 +49,9 @@ def prepare(config: FleetConfig, folder: RunFolder, source: Source, progress: Pr
         prepared = prepare_recorded(config, folder, source)
     else:
         prepared = prepare_simulated(config, folder, source.worlds, progress)
+    if source.made_up:
+        boxed, made_up = with_made_up_boxes(prepared.agent_drives, source.made_up, folder.world / "drives" / "made-up")
+        prepared = replace(prepared, agent_drives=boxed, made_up=made_up)
     folder_of_copies = folder.world / "drives" / "wrong-mounts"
     drives = with_wrong_mounts(prepared.agent_drives, config.wrong_mounts_rad, folder_of_copies)
     return replace(prepared, agent_drives=drives)

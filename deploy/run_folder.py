@@ -33,6 +33,11 @@ class RunFolder:
         return self.root / "world"
 
     @property
+    def imported(self) -> Path:
+        """Folder of the drives that recordings became; it stays after the run."""
+        return self.root / "imported"
+
+    @property
     def agents(self) -> Path:
         """Folder of one work folder per vehicle."""
         return self.root / "agents"

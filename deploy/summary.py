@@ -11,6 +11,7 @@ from gnd.deploy.fleet import FleetOutcome, count_lines
 from gnd.deploy.fleet_config import FleetConfig
 from gnd.deploy.learning import account_learning, learning_lines
 from gnd.deploy.live_traffic import traffic_lines
+from gnd.deploy.made_up import made_up_lines, score_made_up
 from gnd.deploy.prepare import PreparedRun
 from gnd.deploy.run_folder import RunFolder
 from gnd.fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
@@ -46,6 +47,7 @@ def write_summary(
         summary["learning"] = account_learning(folder, store, truth, {h.tile.tile: h.before for h in histories})
         summary["waiting_for_confirmation"] = waiting_totals(store)
         summary["named_vehicles"] = named_vehicles(store)
+        summary["made_up"] = score_made_up(prepared.made_up, histories)
         summary["features"] = _score_features(config, prepared, store)
     summary["prepare_s"] = round(prepare_s, 1)
     summary["doubtful"] = doubtful_vehicles(results)
@@ -138,8 +140,8 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         summary["waiting_for_confirmation"],
     )
     lines = [
-        f"{summary['agents']} agents drove {summary['drive_km']:.2f} km on {summary['link']} links "
-        f"in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
+        f"{summary['agents']} agent{'' if summary['agents'] == 1 else 's'} drove {summary['drive_km']:.2f} km"
+        f" on {summary['link']} links in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
         f"{summary['reports_sent']} reports sent, {summary['reports_acknowledged']} acknowledged, "
         f"{summary['reports_lost']} lost; {summary['tiles_published']} tile versions published, "
         f"{summary['updates_received']} updates received, {summary['changed_voxels']} voxels changed",
@@ -147,7 +149,8 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     ]
     if waiting["voxels"]:
         lines.append(
-            f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles (`gnd map status`)"
+            f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles: another vehicle that"
+            " finds the same confirms it (`gnd map status`)"
         )
     lines += [one["says"] for one in summary["named_vehicles"]]
     if p95["longitudinal_m"] is not None:
@@ -159,6 +162,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         lines.append(
             f"map against the truth, macro F1: {f1['before']:.1f} % before, {_single_text(f1)}{f1['after']:.1f} % after"
         )
+    lines += made_up_lines(summary.get("made_up"))
     lines += learning_lines(summary.get("learning", {}))
     lines += [
         f"{vehicle} doubts itself: {d['scans_shifted'] + d['scans_taken_back']} scans taken back, "

@@ -20,20 +20,22 @@ from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.errors import BusConfigError, NoRouter
 from gnd.fleet_bus.part import Part
+from gnd.fleet_bus.ros2_attachments import GID_BYTES, RosAttachment
+from gnd.fleet_bus.ros2_service import RosHandler, RosService
 from gnd.fleet_bus.workers import Workers
 
 TOKENS: Final = "@ros2_lv"
 NO_HASH: Final = "TypeHashNotSupported"
 """Of publishers of ROS 2 Humble, whose types have no hash."""
 ANY_HASH: Final = "*"
-GID_BYTES: Final = 16
 MAX_DOMAIN: Final = 232
 _MANGLED_SLASH: Final = "%"
 _DEFAULT_DEPTH: Final = 10
 _SHUT_OUT: Final = frozenset("*$#?")
 """Characters with a meaning in key expressions: no name of ROS has them."""
-EndpointKind = Literal["MP", "MS"]
-"""Publisher, or subscription, of messages."""
+EndpointKind = Literal["MP", "MS", "SS", "SC"]
+"""Publisher or subscription of messages, server or client of a service."""
+_KINDS: Final[dict[str, EndpointKind]] = {"MP": "MP", "MS": "MS", "SS": "SS", "SC": "SC"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +75,11 @@ LATCHED_QOS: Final = RosQos(latched=True, depth=1)
 
 @dataclass(frozen=True, slots=True)
 class RosTopic:
-    """A topic: where messages of which type go.
+    """A topic: where messages of which type go; or a service: its name and its type.
 
     Attributes:
         name: absolute, such as "/points".
-        type_name: such as "sensor_msgs/msg/PointCloud2".
+        type_name: such as "sensor_msgs/msg/PointCloud2", or of a service "std_srvs/srv/SetBool".
         type_hash: "RIHS01_...", `NO_HASH`; `ANY_HASH`: whatever the publisher has.
     """
 
@@ -124,7 +126,7 @@ class RosMessage:
 
 @dataclass(frozen=True, slots=True)
 class RosEndpoint:
-    """A publisher or a subscription that is alive in a domain."""
+    """A publisher, a subscription, a server or a client that is alive in a domain."""
 
     kind: EndpointKind
     node: str
@@ -133,9 +135,9 @@ class RosEndpoint:
 
 
 def endpoint_of_token(token: str) -> RosEndpoint | None:
-    """What a liveliness token tells; None for nodes, services, and what is no token of ours to read."""
+    """What a liveliness token tells; None for nodes, and what is no token of ours to read."""
     parts = token.split("/")
-    if len(parts) != 13 or parts[0] != TOKENS or parts[5] not in ("MP", "MS"):
+    if len(parts) != 13 or parts[0] != TOKENS or parts[5] not in _KINDS:
         return None
     package, _, rest = parts[10].partition("::")
     kind, _, name = rest.partition("::dds_::")
@@ -145,22 +147,7 @@ def endpoint_of_token(token: str) -> RosEndpoint | None:
     except BusConfigError:
         return None
     space = parts[7].replace(_MANGLED_SLASH, "/").rstrip("/")
-    return RosEndpoint("MP" if parts[5] == "MP" else "MS", f"{space}/{parts[8]}", topic, qos)
-
-
-def attachment(sequence: int, published_ns: int, publisher: bytes) -> bytes:
-    """What goes beside each message."""
-    values = "sequence_number", ext.Int64(sequence), "source_timestamp", ext.Int64(published_ns), "source_gid"
-    return bytes(ext.z_serialize((*values, publisher)).to_bytes())
-
-
-def read_attachment(data: bytes) -> tuple[int, int, bytes]:
-    """Sequence number, time in ns and publisher; zeros and b"" where there is none, or one that is not understood."""
-    try:
-        read = ext.z_deserialize(tuple[str, ext.Int64, str, ext.Int64, str, bytes], zenoh.ZBytes(data))
-    except ext.ZDeserializeError:
-        return 0, 0, b""
-    return int(read[1]), int(read[3]), bytes(read[5])
+    return RosEndpoint(_KINDS[parts[5]], f"{space}/{parts[8]}", topic, qos)
 
 
 class RosNode:
@@ -222,8 +209,23 @@ class RosNode:
         self.bus.declare_alive(self._endpoint_token("MS", topic, qos))
         return self.bus.keep(RosSubscription(self.bus.connection, topic, key, callback, qos))
 
+    def serve(self, service: RosTopic, handler: RosHandler) -> RosService:
+        """Answer the requests of a service, also those of clients of ROS 2 Humble, whose types have no hash.
+
+        Args:
+            service: its name and type, with the hash of the type.
+            handler: the answer to a request, both CDR; called in threads of our own, several at a time. `Refused`
+                and whatever else it raises becomes an error at the client, which rmw_zenoh's clients only log.
+        """
+        if service.type_hash == ANY_HASH:
+            raise BusConfigError(f"{service.name}: a service needs the hash of {service.type_name}")
+        keys = (service.key(self.domain), replace(service, type_hash=NO_HASH).key(self.domain))
+        serving = self.bus.keep(RosService(self.bus.connection, service.name, keys, handler))
+        self.bus.declare_alive(self._endpoint_token("SS", service, RosQos()))  # who sees it may ask at once
+        return serving
+
     def endpoints(self, timeout_s: float = 2.0) -> list[RosEndpoint]:
-        """The publishers and subscriptions that are alive in the domain, this node's own among them."""
+        """The publishers, subscriptions, servers and clients alive in the domain, this node's own among them."""
         with self.bus.connection.sending() as session:
             replies = session.liveliness().get(f"{TOKENS}/{self.domain}/**", timeout=timeout_s)
             tokens = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
@@ -286,7 +288,8 @@ class RosPublisher(Part):
         self._connection.outgoing(payload, "control", None)
         published_ns = time.time_ns() if published_ns is None else published_ns
         with self._connection.sending():
-            self.declared.put(payload, attachment=attachment(next(self._numbers), published_ns, self._gid))
+            beside = RosAttachment(next(self._numbers), published_ns, self._gid)
+            self.declared.put(payload, attachment=beside.encode())
 
     def _end(self) -> None:
         self.undeclare()
@@ -321,7 +324,9 @@ class RosSubscription(Part):
 
     def _accept(self, sample: zenoh.Sample) -> None:
         beside = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        message = RosMessage(self.topic.name, sample.payload.to_bytes(), *read_attachment(beside))
+        told = RosAttachment.decode(beside) or RosAttachment(0, 0, b"")
+        payload = sample.payload.to_bytes()
+        message = RosMessage(self.topic.name, payload, told.sequence, told.sent_ns, told.gid)
         self._note(message.publisher, message.sequence)
         if not self._workers.offer_newest(message):
             self.dropped += 1

@@ -30,6 +30,7 @@ from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
 from gnd.vehicle_agent.importers.deskewing import with_times
 from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.fitting import fit_heading_and_position as fit_heading_and_position
+from gnd.vehicle_agent.importers.journal import ImportJournal, kept_on_interrupt, key_of
 from gnd.vehicle_agent.importers.kitti import open_kitti
 from gnd.vehicle_agent.importers.kitti_raw import open_kitti_raw
 from gnd.vehicle_agent.importers.las import open_las
@@ -142,13 +143,17 @@ def import_recording(
 
     Raises:
         ImportDriveError: the folder is missing, holds no scans of that format, is damaged, or does not say where on
-            the Earth it was recorded; or `out` is one of the files that are read.
+            the Earth it was recorded; or `out` is one of the files that are read, or another process writes it.
         DriveError: the drive cannot be written.
     """
     choices = replace(choices, anchor=anchor or choices.anchor, topic=topic or choices.topic)
-    check_output(out, folder, *([Path(choices.poses)] if choices.poses else []))
+    inputs = (folder, *choices.files)
+    check_output(out, *inputs)
     recording = open_recording(kind, folder, choices.anchor, choices.topic, choices)
-    return import_opened(recording, out, scans=scans, vehicle=vehicle, choices=choices, progress=progress)
+    with kept_on_interrupt(ImportJournal(out, key_of(kind, inputs, choices))) as journal:
+        return import_opened(
+            recording, out, scans=scans, vehicle=vehicle, choices=choices, progress=progress, journal=journal
+        )
 
 
 def import_opened(
@@ -159,8 +164,12 @@ def import_opened(
     vehicle: str = "recorded",
     choices: Choices = DEFAULTS,
     progress: Progress = no_progress,
+    journal: ImportJournal | None = None,
 ) -> Imported:
-    """The same with a recording that is open already; whoever calls has looked that `out` is none of its files."""
+    """The same with a recording that is open already; whoever calls has looked that `out` is none of its files.
+
+    journal: of an import of these files to `out`; without one an interrupted import begins anew.
+    """
     chosen_scans(scans, len(recording))  # a wrong rule is named before the long work
     if not (recording.placed or choices.nowhere):
         raise ImportDriveError(
@@ -172,7 +181,7 @@ def import_opened(
     if not choices.strict:
         recording = passing_over(recording, bad)
     recording = replace(recording, notes=(*recording.notes, *_made_up_times(recording), *suspicious_scans(recording)))
-    recording, track = prepared(recording, progress)
+    recording, track = prepared(recording, progress, journal)
     recording = replace(recording, notes=(*recording.notes, *check_track(recording, track)))
     imported = write_drive(recording, track, out, scans, vehicle, progress, stand_ins=choices.stand_ins)
     return replace(imported, bad=bad.reasons, quality=quality_of(recording, track))
@@ -284,7 +293,9 @@ def drive_id_of(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]", "_", name)[-64:] or "drive"
 
 
-def prepared(recording: Recording, progress: Progress = no_progress) -> tuple[Recording, Trajectory]:
+def prepared(
+    recording: Recording, progress: Progress = no_progress, journal: ImportJournal | None = None
+) -> tuple[Recording, Trajectory]:
     """A recording with times of points and a mount, found where it gives none, and T_map_vehicle of every scan.
 
     Raises:
@@ -294,7 +305,7 @@ def prepared(recording: Recording, progress: Progress = no_progress) -> tuple[Re
     if recording.track is not None:
         recording, track = with_mount(recording, recording.track)
         return replace(recording, track=track), track
-    recording, track = with_mount(recording, lidar_odometry(recording, progress))
+    recording, track = with_mount(recording, lidar_odometry(recording, progress, journal))
     track = Trajectory(track.t_ns, T_inverse(track.T_dst_vehicle[0]) @ track.T_dst_vehicle)
     laid = _over_the_fixes(recording, track)
     return replace(recording, notes=(*recording.notes, *_heading_note(recording, laid))), laid

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from gnd.vehicle_agent.importer import AUTO, FORMATS, import_opened, open_recording
 from gnd.vehicle_agent.importers.choices import METRES_OF, Choices, anchor_of_text, fields_of_text, mount_of_text
 from gnd.vehicle_agent.importers.fields import ANY_FIELD
+from gnd.vehicle_agent.importers.journal import ImportJournal, kept_on_interrupt, kept_scans, key_of
 from gnd.vehicle_agent.importers.listing import listed, listing, result_of
 from gnd.vehicle_agent.importers.output import check_output
 from gnd.vehicle_agent.importers.recording import Recording
@@ -47,7 +48,7 @@ def import_drives(
     """
     choices = _choices(**options)
     if out is not None:
-        check_output(out, folder, *([Path(choices.poses)] if choices.poses else []))
+        check_output(out, folder, *choices.files)
     recording = open_recording(kind, folder, choices=choices)
     if not as_json:
         for line in listing(recording):
@@ -56,8 +57,13 @@ def import_drives(
         if as_json:
             click.echo(json.dumps(listed(recording), indent=1))
         return
-    with step_bars() as progress:
-        imported = import_opened(recording, out, scans=scans, vehicle=vehicle, choices=choices, progress=progress)
+    key = key_of(kind, (folder, *choices.files), choices)
+    with _told_on_interrupt(out), kept_on_interrupt(ImportJournal(out, key)) as journal, step_bars() as progress:
+        if journal.found:
+            _say(f"{out}: resumes at scan {journal.found[-1].number + 1} of {len(recording)} of LiDAR odometry")
+        imported = import_opened(
+            recording, out, scans=scans, vehicle=vehicle, choices=choices, progress=progress, journal=journal
+        )
     if as_json:
         click.echo(json.dumps({**listed(recording), "drive": str(out), **result_of(imported)}, indent=1))
         return
@@ -65,6 +71,23 @@ def import_drives(
     for sentence in (*(imported.quality.lines if imported.quality else ()), *imported.skipped):
         click.echo(f"{out}: {sentence}")
     click.echo(f"next: {next_command(recording, out, choices)}")
+
+
+def _say(sentence: str) -> None:
+    """To people, beside the output."""
+    click.echo(sentence, err=True)
+
+
+@contextmanager
+def _told_on_interrupt(out: Path) -> Iterator[None]:
+    """Say how to go on when somebody ends the import."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        kept = kept_scans(out)
+        how = f"goes on after {kept} scans of LiDAR odometry" if kept else "begins anew"
+        _say(f"gnd: {out} is not written; the same command {how}")
+        raise
 
 
 def next_command(recording: Recording, out: Path, choices: Choices) -> str:

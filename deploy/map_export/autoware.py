@@ -11,7 +11,7 @@ autoware_map_loader (autoware_core), which asks for cells of about 20 m.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -34,6 +34,7 @@ CLOUDS: Final = "pointcloud_map.pcd"
 """The folder of the cells; Autoware's launch files look for this name."""
 METADATA: Final = "pointcloud_map_metadata.yaml"
 PROJECTOR: Final = "map_projector_info.yaml"
+_POINT_BYTES: Final = 12
 _OURS: Final = re.compile(r"(-?\d+)_(-?\d+)_[0-9a-f]{12}\.pcd")
 _ENTRY: Final = re.compile(r"(\S+\.pcd): \[(-?\d+), (-?\d+)\]")
 
@@ -71,6 +72,27 @@ class AutowareExport:
     size_bytes: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudCell:
+    """One cell of a map.
+
+    Attributes:
+        corner: x and y of its south-west corner, m.
+        cloud: (N, 3) its points.
+    """
+
+    corner: tuple[int, int]
+    cloud: F32
+
+
+@dataclass(frozen=True, slots=True)
+class ChangedCells:
+    """How many cells of a folder were written, and how many removed."""
+
+    written: int
+    removed: int
+
+
 def export_autoware(
     store: Store,
     layer: str,
@@ -95,25 +117,10 @@ def export_autoware(
         ProjectionError: the region is too large for the projection, or the one before differs.
     """
     tiles = region_tiles(store, layer, prefix)
-    try:
-        _entries(folder)  # refuses a folder of another program
-        projection = _projection(tiles, folder, projector)
-        cells = {_name(corner, cloud): (corner, cloud) for corner, cloud in _cells(tiles, projection, points)}
-        (folder / CLOUDS).mkdir(parents=True, exist_ok=True)
-        _write(folder / PROJECTOR, projection.yaml().encode())
-        kept = {name for name in cells if (folder / CLOUDS / name).is_file()}
-        for name in cells.keys() - kept:
-            _write(folder / CLOUDS / name, _pcd(cells[name][1]))
-        lines = [f"x_resolution: {CELL_M}.0", f"y_resolution: {CELL_M}.0"]
-        lines += [f"{name}: [{corner[0]}, {corner[1]}]" for name, (corner, _) in sorted(cells.items())]
-        _write(folder / METADATA, "\n".join((*lines, "")).encode())
-        # those of an export that was interrupted, too
-        gone = {path.name for path in (folder / CLOUDS).iterdir() if _OURS.fullmatch(path.name)} - cells.keys()
-        for name in gone:
-            (folder / CLOUDS / name).unlink()
-        size_bytes = sum((folder / CLOUDS / name).stat().st_size for name in cells)
-    except OSError as error:
-        raise ExportError(f"{folder}: cannot write: {error.strerror or error}") from error
+    projection = projection_of(tiles, folder, projector)
+    cells = cells_of(tiles, projection, points)
+    changed = write_cells(folder, projection, {name: cell.corner for name, cell in cells.items()}, cells)
+    size_bytes = sum((folder / CLOUDS / name).stat().st_size for name in cells)
     return AutowareExport(
         folder=folder,
         projector=projection.projector,
@@ -122,10 +129,10 @@ def export_autoware(
         scale=projection.scale,
         square=projection.square,
         gaussians=sum(len(tile.gaussians) for tile in tiles),
-        points=sum(len(cloud) for _, cloud in cells.values()),
-        written=len(cells) - len(kept),
-        kept=len(kept),
-        removed=len(gone),
+        points=sum(len(cell.cloud) for cell in cells.values()),
+        written=changed.written,
+        kept=len(cells) - changed.written,
+        removed=changed.removed,
         size_bytes=size_bytes,
     )
 
@@ -134,6 +141,99 @@ def map_points(tile: Tile, projection: Projection, points: PointsOf) -> F64:
     """(N, 3) points of a tile in the frame of an exported map: x and y projected, z the ellipsoidal height, m."""
     lat, lon, height = LocalFrame.of_tile(tile.tile_id).geodetic_from_enu(points_of_tile(tile, points))
     return np.stack([*projection.forward(lat, lon), height], axis=1)
+
+
+def projection_of(tiles: list[Tile], folder: Path, projector: str | None) -> Projection:
+    """That of the export before, where there is one; else one whose origin is the middle of the tiles.
+
+    Raises:
+        ExportError: the folder holds a map of another program.
+        ProjectionError: the export before has another one.
+    """
+    _entries(folder)
+    path = folder / PROJECTOR
+    text = path.read_text() if path.is_file() else None
+    made = projection_in(text) if text is not None else None
+    if made is None or projector not in (None, made.projector):
+        middle = region_frame(tiles)
+        lat_deg, lon_deg = float(np.degrees(middle.lat_rad)), float(np.degrees(middle.lon_rad))
+        fallback = "TransverseMercator" if text is None else "MGRS"
+        made = projection_for(projector or fallback, lat_deg, lon_deg, _ground_m(tiles))
+    if text is not None and text != made.yaml():
+        name = f"{made.projector} {made.square}".strip()
+        raise ProjectionError(
+            f"{path} says another projection than {name} with heights above the ellipsoid, or says it in other words: "
+            "give an empty folder"
+        )
+    return made
+
+
+def cells_of(tiles: Sequence[Tile], projection: Projection, points: PointsOf) -> dict[str, CloudCell]:
+    """The cells of some tiles by their names. The order of points is that of tiles and voxels: the same each time."""
+    clouds = [map_points(tile, projection, points) for tile in tiles]
+    cloud = np.concatenate([np.zeros((0, 3)), *clouds]).astype(np.float32)
+    corners, cell = np.unique(_corners(cloud), axis=0, return_inverse=True)
+    order = np.argsort(cell.ravel(), kind="stable")
+    parts = _parts(order, cell.ravel(), len(corners))
+    made = [CloudCell((int(x), int(y)), cloud[rows]) for (x, y), rows in zip(corners, parts, strict=True)]
+    return {_name(one): one for one in made}
+
+
+def corners_of(tile: Tile, projection: Projection, points: PointsOf) -> frozenset[tuple[int, int]]:
+    """The south-west corners, m, of the cells in which a tile has points."""
+    cloud = map_points(tile, projection, points).astype(np.float32)
+    return frozenset((int(x), int(y)) for x, y in np.unique(_corners(cloud), axis=0))
+
+
+def write_cells(
+    folder: Path, projection: Projection, corners: Mapping[str, tuple[int, int]], cells: Mapping[str, CloudCell]
+) -> ChangedCells:
+    """Make a folder the map of these cells: files that are there stay, those of other cells go.
+
+    Args:
+        folder: it is made when missing.
+        projection: of the points.
+        corners: the cells by name.
+        cells: with the points of those among them whose files may be missing.
+
+    Raises:
+        ExportError: it cannot be written; what was there is still there.
+    """
+    try:
+        (folder / CLOUDS).mkdir(parents=True, exist_ok=True)
+        _write(folder / PROJECTOR, projection.yaml().encode())
+        missing = [name for name in cells if not (folder / CLOUDS / name).is_file()]
+        for name in missing:
+            _write(folder / CLOUDS / name, _pcd(cells[name].cloud))
+        lines = [f"x_resolution: {CELL_M}.0", f"y_resolution: {CELL_M}.0"]
+        lines += [f"{name}: [{x}, {y}]" for name, (x, y) in sorted(corners.items())]
+        _write(folder / METADATA, "\n".join((*lines, "")).encode())
+        # those of an export that was interrupted, too
+        gone = {path.name for path in (folder / CLOUDS).iterdir() if _OURS.fullmatch(path.name)} - corners.keys()
+        for name in gone:
+            (folder / CLOUDS / name).unlink()
+    except OSError as error:
+        raise ExportError(f"{folder}: cannot write: {error.strerror or error}") from error
+    return ChangedCells(len(missing), len(gone))
+
+
+def place_of(name: str) -> str:
+    """What a cell's name says of its place, without its content; of other names a part."""
+    return name.rpartition("_")[0]
+
+
+def read_cell(path: Path) -> F32:
+    """(N, 3) the points of a cell's file; ExportError: it cannot be read, or is not what was written."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ExportError(f"{path}: cannot read: {error.strerror or error}") from error
+    _, mark, body = data.partition(b"DATA binary\n")
+    if not mark or len(body) % _POINT_BYTES or _digest(body) != path.stem.rpartition("_")[2]:
+        raise ExportError(
+            f"{path}: {len(data)} bytes that are not the cell of this name: export into this folder again"
+        )
+    return np.frombuffer(body, "<f4").reshape(-1, 3)
 
 
 def read_metadata(folder: Path) -> dict[str, tuple[int, int]]:
@@ -158,25 +258,6 @@ def _entries(folder: Path) -> dict[str, tuple[int, int]]:
     return entries
 
 
-def _projection(tiles: list[Tile], folder: Path, projector: str | None) -> Projection:
-    """That of the export before, where there is one; else one whose origin is the middle of the tiles."""
-    path = folder / PROJECTOR
-    text = path.read_text() if path.is_file() else None
-    made = projection_in(text) if text is not None else None
-    if made is None or projector not in (None, made.projector):
-        middle = region_frame(tiles)
-        lat_deg, lon_deg = float(np.degrees(middle.lat_rad)), float(np.degrees(middle.lon_rad))
-        fallback = "TransverseMercator" if text is None else "MGRS"
-        made = projection_for(projector or fallback, lat_deg, lon_deg, _ground_m(tiles))
-    if text is not None and text != made.yaml():
-        name = f"{made.projector} {made.square}".strip()
-        raise ProjectionError(
-            f"{path} says another projection than {name} with heights above the ellipsoid, or says it in other words: "
-            "give an empty folder"
-        )
-    return made
-
-
 def _ground_m(tiles: list[Tile]) -> float:
     """The median height of the Gaussians' floors."""
     floors = [VoxelGrid.of(tile.tile_id).unravel(tile.gaussians.voxel_id)[2] for tile in tiles]
@@ -184,23 +265,20 @@ def _ground_m(tiles: list[Tile]) -> float:
     return float(np.median(heights)) if len(heights) else 0.0
 
 
-def _cells(tiles: list[Tile], projection: Projection, points: PointsOf) -> Iterator[tuple[tuple[int, int], F32]]:
-    """South-west corner and points of each cell. The order within is that of tiles and voxels: the same each time."""
-    clouds = [map_points(tile, projection, points) for tile in tiles]
-    cloud = np.concatenate(clouds).astype(np.float32)
-    index = np.floor(cloud[:, :2].astype(np.float64) / CELL_M).astype(np.int64)
-    corners, cell = np.unique(index, axis=0, return_inverse=True)
-    order = np.argsort(cell.ravel(), kind="stable")
-    for corner, rows in zip(corners, _parts(order, cell.ravel(), len(corners)), strict=True):
-        yield (int(corner[0]) * CELL_M, int(corner[1]) * CELL_M), cloud[rows]
-
-
 def _parts(order: npt.NDArray[np.int64], cell: npt.NDArray[np.int64], n: int) -> list[npt.NDArray[np.int64]]:
     return np.split(order, np.searchsorted(cell[order], np.arange(1, n))) if n else []
 
 
-def _name(corner: tuple[int, int], cloud: F32) -> str:
-    return f"{corner[0]}_{corner[1]}_{sha256(cloud.tobytes()).hexdigest()[:12]}.pcd"
+def _corners(cloud: F32) -> npt.NDArray[np.int64]:
+    return np.asarray(np.floor(cloud[:, :2].astype(np.float64) / CELL_M).astype(np.int64) * CELL_M)
+
+
+def _name(cell: CloudCell) -> str:
+    return f"{cell.corner[0]}_{cell.corner[1]}_{_digest(cell.cloud.tobytes())}.pcd"
+
+
+def _digest(points: bytes) -> str:
+    return sha256(points).hexdigest()[:12]
 
 
 def _pcd(cloud: F32) -> bytes:

@@ -1,11 +1,11 @@
-"""What Autoware's GetDifferentialPointCloudMap asks for, answered from an exported map.
+"""What Autoware's GetDifferentialPointCloudMap asks for: which cells of an area a client lacks, and which it drops.
 
-`gnd map export STORE FOLDER --to autoware` again brings the folder up to date; a client whose cells have changed names
-them by their old names, gets the new ones and is told to drop the old. Messages and bus are not part of this.
+A client names the cells that it has by their ids, the names of their files. Those change with the content: a client
+whose cells have changed names them by their old names, gets the new ones and is told to drop the old.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,14 @@ class Area:
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, (self.center_x, self.center_y, self.radius))) or self.radius < 0.0:
             raise ExportError(f"an area needs finite values and a radius of at least 0, got {self}")
+
+    def distance_m(self, corner: tuple[int, int]) -> float:
+        """How far the nearest point of a cell lies from the centre, m."""
+        off = [
+            max(low - centre, 0.0, centre - (low + CELL_M))
+            for low, centre in zip(corner, (self.center_x, self.center_y), strict=True)
+        ]
+        return math.hypot(*off)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,18 +53,15 @@ def differential_map(folder: Path, area: Area, cached_ids: Iterable[str]) -> Dif
     Raises:
         ExportError: the folder holds no exported map.
     """
-    inside = {name for name, corner in read_metadata(folder).items() if _touches(corner, area)}
+    inside = cells_in(read_metadata(folder), area)
     cached = set(cached_ids)
     return Difference(
-        new={name: folder / CLOUDS / name for name in sorted(inside - cached)},
-        ids_to_remove=tuple(sorted(cached - inside)),
+        new={name: folder / CLOUDS / name for name in inside if name not in cached},
+        ids_to_remove=tuple(sorted(cached.difference(inside))),
     )
 
 
-def _touches(corner: tuple[int, int], area: Area) -> bool:
-    """Whether a cell and the circle have a point in common."""
-    off = [
-        max(low - centre, 0.0, centre - (low + CELL_M))
-        for low, centre in zip(corner, (area.center_x, area.center_y), strict=True)
-    ]
-    return math.hypot(*off) <= area.radius
+def cells_in(corners: Mapping[str, tuple[int, int]], area: Area) -> list[str]:
+    """The ids of the cells that have a point in common with the circle, the nearest to its centre first."""
+    far_m = {name: area.distance_m(corner) for name, corner in corners.items()}
+    return sorted((name for name in far_m if far_m[name] <= area.radius), key=lambda name: (far_m[name], name))

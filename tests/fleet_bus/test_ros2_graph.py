@@ -5,7 +5,6 @@ import time
 
 import pytest
 import zenoh
-from zenoh import ext
 
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -18,11 +17,10 @@ from gnd.fleet_bus.ros2 import (
     RosNode,
     RosQos,
     RosTopic,
-    attachment,
     endpoint_of_token,
     publishers_of,
-    read_attachment,
 )
+from gnd.fleet_bus.ros2_attachments import RosAttachment
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = RosTopic("/chatter", "std_msgs/msg/String", STRING_HASH)
@@ -84,14 +82,21 @@ def test_quality_of_service_survives_a_token(qos: RosQos) -> None:
     assert RosQos.of_text(str(qos)) == qos
 
 
-def test_attachments_are_those_of_zenohs_serializer() -> None:
-    made = attachment(5, 7, bytes(range(16)))
-    assert made == b"\x0fsequence_number\x05" + bytes(7) + b"\x10source_timestamp\x07" + bytes(7) + (
-        b"\x0asource_gid\x10" + bytes(range(16))
-    )
-    assert read_attachment(made) == (5, 7, bytes(range(16)))
-    for damaged in (b"", made[:-1], b"\xff" * 40, ext.z_serialize("sequence_number").to_bytes()):
-        assert read_attachment(damaged) == (0, 0, b"")
+GID = bytes(range(16))
+PLAIN = b"\x05" + bytes(7) + b"\x07" + bytes(7) + b"\x10" + GID
+NAMED = b"\x0fsequence_number\x05" + bytes(7) + b"\x10source_timestamp\x07" + bytes(7) + b"\x0asource_gid\x10" + GID
+
+
+@pytest.mark.parametrize(("data", "has_names"), [(PLAIN, False), (NAMED, True)])
+def test_attachments_have_the_bytes_of_both_layouts_of_rmw_zenoh(data: bytes, has_names: bool) -> None:
+    assert RosAttachment(5, 7, GID, has_names).encode() == data
+    assert RosAttachment.decode(data) == RosAttachment(5, 7, GID, has_names)
+
+
+def test_other_bytes_are_no_attachment() -> None:
+    assert RosAttachment(5, 7, GID).encode() == PLAIN  # what releases since 2025 read
+    for damaged in (b"", PLAIN[:-1], NAMED[:-1], b"\xff" * 40, b"\x0fsequence_number"):
+        assert RosAttachment.decode(damaged) is None
 
 
 @pytest.mark.parametrize(
@@ -179,7 +184,7 @@ def test_a_gap_in_the_numbers_is_counted_as_lost(router: str) -> None:
         time.sleep(0.2)
         with plain.connection.sending() as session:
             for sequence in (1, 2, 6):
-                session.put(topic.key(7), zenoh.ZBytes(HELLO), attachment=attachment(sequence, 0, bytes(16)))
+                session.put(topic.key(7), zenoh.ZBytes(HELLO), attachment=RosAttachment(sequence, 0, GID).encode())
         assert wait_for(lambda: len(got) == 3)
         assert subscription.lost == 3
 

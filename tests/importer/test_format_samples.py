@@ -8,6 +8,7 @@ import laspy
 import numpy as np
 import pyarrow as pa
 import pytest
+from ouster_testing import write_pcap
 from pyarrow import feather
 from recording_testing import scan_of, true_pose, write_bin
 
@@ -342,7 +343,10 @@ def test_a_damaged_capture_says_that_the_rest_is_left_out(shared_data, tmp_path)
 
 
 def test_a_capture_of_another_sensor_says_what_to_do(shared_data, tmp_path):
-    with pytest.raises(ImportDriveError, match=r"no packets of a Velodyne .*64 of 8448 bytes.*ouster-cli source"):
+    unknown = write_pcap(tmp_path / "b.pcap", [(10**18 + k, "10.0.0.1", 2368, b"\0" * 1234) for k in range(5)])
+    with pytest.raises(ImportDriveError, match=r"no packets of a Velodyne .* or an Ouster but 5 of 1234 bytes.*driver"):
+        open_recording("auto", unknown)
+    with pytest.raises(ImportDriveError, match=r"1 whole frame of OS-0-128; a drive needs at least 2"):
         open_recording("auto", shared_data / "captures_a" / "OS-0-128-U1_v2.3.0_1024x10.pcap")
     (tmp_path / "a.pcap").write_bytes(b"\xd4\xc3\xb2\xa1" + b"\0" * 9)
     with pytest.raises(ImportDriveError, match=r"a\.pcap"):
@@ -376,7 +380,7 @@ def test_a_name_that_lies_is_found_out(tmp_path, shared_data):
         format_of(tmp_path / "folder")
 
 
-@pytest.mark.parametrize(("kind", "module"), [("argoverse", "pyarrow"), ("las", "laspy"), ("pcap", "velodyne_decoder")])
+@pytest.mark.parametrize(("kind", "module"), [("argoverse", "pyarrow"), ("las", "laspy"), ("pcap", "dpkt")])
 def test_without_its_library_a_format_says_which_extra(tmp_path, shared_data, monkeypatch, kind, module):
     place = {
         "argoverse": lambda: shared_data / "av2_pit_overlap" / "7fab2350",

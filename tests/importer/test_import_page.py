@@ -29,6 +29,7 @@ def test_the_page_says_what_the_command_prints(shared_data, tmp_path, monkeypatc
     """Words exactly, numbers to 5 %: estimates differ in their last digits from machine to machine."""
     for path in shared_data.iterdir():
         (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "ouster_golden").symlink_to(Path(__file__).parent / "ouster_golden")
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(import_drives, command.split())
     printed = result.stdout + (f"gnd: {result.exception}\n" if result.exception else "")

@@ -45,6 +45,11 @@ class Choices:
     nowhere: bool = False
     stand_ins: bool = False
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What may be files among the choices."""
+        return tuple(Path(one) for one in (self.poses, self.sensor) if one)
+
     def __post_init__(self) -> None:
         if self.unit not in METRES_OF:
             raise ImportDriveError(f"--units {self.unit}: known are {', '.join(METRES_OF)}")

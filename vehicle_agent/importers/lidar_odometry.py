@@ -7,6 +7,7 @@ this follows what stands (8.0 m); point-to-point neighbours (small_gicp) stayed 
 and then broke.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -23,6 +24,7 @@ from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.errors import ImportDriveError, RegistrationError
 from gnd.vehicle_agent.importers.cleaning import cleaned
+from gnd.vehicle_agent.importers.journal import FoundPose, ImportJournal
 from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
@@ -38,6 +40,8 @@ RANGE_M: Final = (2.0, 80.0)
 """Points nearer are the vehicle itself, points farther blur the map."""
 NEAR_M, KEPT_M = 100.0, 200.0
 """Tiles this near are matched with; tiles farther away than the other are forgotten."""
+REACH_M: Final = RANGE_M[1] + 20.0
+"""From the vehicle to the farthest point of a scan that the map takes: the mount and the way of a sweep are in it."""
 CARRIED: Final = 0.8
 """Share of the last step that the next one is taken to have: all of it lets an error of the turn grow on itself."""
 FIRST_STEPS_M: Final = ((0.0, 0.0), (1.5, 0.0), (3.0, 0.0), (-1.5, 0.0), (0.0, 1.5), (0.0, 3.0), (0.0, -1.5))
@@ -56,17 +60,25 @@ _REGISTRATION: Final = RegistrationParameters()
 _SAMPLING: Final = SamplingParameters(n_points=4000)
 
 
-def lidar_odometry(recording: Recording, progress: Progress) -> Trajectory:
+def lidar_odometry(recording: Recording, progress: Progress, journal: ImportJournal | None = None) -> Trajectory:
     """T_first_vehicle of every scan, at the middle of its sweep; the first is the identity.
+
+    journal: keeps the poses as they are found; those that it holds already are taken, and the result is the same to
+    the bit.
 
     Raises:
         ImportDriveError: a scan does not fit those before it.
     """
-    odometry = _Odometry(recording)
-    for i in range(len(recording)):
+    odometry, first = _Odometry(recording), 0
+    if journal is not None and journal.found:
+        odometry.resume(journal.found, progress)
+        first = journal.found[-1].number + 1
+    for i in range(first, len(recording)):
         scan = cleaned(recording.read(i)).scan
         if scan is not None:
             odometry.add(scan, i)
+            if journal is not None:
+                journal.add(odometry.last(i))
         progress("LiDAR odometry", i + 1, len(recording))
     return odometry.trajectory
 
@@ -127,8 +139,16 @@ class _GrowingMap:
 
     def forget(self, p_map_m: F64) -> None:
         """Drop the tiles far from a place: bounded memory on a long drive."""
-        kept = self._tiles(p_map_m, KEPT_M)
+        kept = self.kept(p_map_m)
         self._points.pop([tile for tile in self._points.finish(1) if tile not in kept])
+
+    def kept(self, p_map_m: F64) -> frozenset[TileId]:
+        """The tiles that `forget` at a place leaves."""
+        return self._tiles(p_map_m, KEPT_M)
+
+    def reached(self, p_map_m: F64) -> frozenset[TileId]:
+        """The tiles that a scan from a place adds to, and perhaps some more."""
+        return self._tiles(p_map_m, REACH_M)
 
 
 def _points_of(tiles: dict[TileId, Gaussians]) -> int:
@@ -164,8 +184,57 @@ class _Odometry:
         points = self._deskewed(scan, t_ns)
         chosen = points[sample_scan(scan.points_m, _SAMPLING)]
         T = self._aligned(chosen, t_ns, number) if self._T else np.eye(4)
+        self._map_points(scan, points, T)
+        self._stand_at(t_ns, T)
+
+    def last(self, number: int) -> FoundPose:
+        """The pose that was found last, as that of scan `number`."""
+        return FoundPose(number, self._t_ns[-1], self._T[-1])
+
+    def resume(self, found: Sequence[FoundPose], progress: Progress) -> None:
+        """Be where `add` of all scans with these poses led to, nothing being there yet.
+
+        Only the scans of which the map still holds something are read; those between that gave no pose are read, too,
+        for what is wrong with them.
+
+        Raises:
+            ImportDriveError: the scans are not those of the poses.
+        """
+        mapped, number = self._still_mapped(found), 0
+        for pose in found:
+            for without in range(number, pose.number):
+                self._recording.read(without)
+            number = pose.number + 1
+            self._take_motion(pose.t_ns)
+            if pose.number in mapped:
+                scan = cleaned(self._recording.read(pose.number)).scan
+                if scan is None or reference_ns(scan) != pose.t_ns:
+                    raise ImportDriveError(f"{self._recording.name}: scan {pose.number} changed since the import began")
+                self._map_points(scan, self._deskewed(scan, pose.t_ns), pose.T)
+            self._stand_at(pose.t_ns, pose.T)
+            progress("LiDAR odometry", number, len(self._recording))
+
+    def _still_mapped(self, found: Sequence[FoundPose]) -> set[int]:
+        """Numbers of the scans that no forgetting after them removes wholly from the map."""
+        forgot_m, at, kept = self._forgot_m, list[int](), list[frozenset[TileId]]()
+        for pose in found:
+            if np.linalg.norm(pose.T[:3, 3] - forgot_m) > NEAR_M:
+                forgot_m = pose.T[:3, 3]
+                at.append(pose.number)
+                kept.append(self._map.kept(forgot_m))
+        mapped = set[int]()
+        for pose in found:
+            reached = self._map.reached(pose.T[:3, 3])
+            after = kept[bisect_left(at, pose.number) :]
+            if not any(reached.isdisjoint(tiles) for tiles in reversed(after)):
+                mapped.add(pose.number)
+        return mapped
+
+    def _map_points(self, scan: Scan, points: F64, T: F64) -> None:
         range_m = np.linalg.norm(scan.points_m, axis=1)
         self._map.add(transform(T, points[(range_m >= RANGE_M[0]) & (range_m <= RANGE_M[1])]))
+
+    def _stand_at(self, t_ns: int, T: F64) -> None:
         self._t_ns.append(t_ns)
         self._T.append(T)
         if np.linalg.norm(T[:3, 3] - self._forgot_m) > NEAR_M:

@@ -23,14 +23,15 @@ def check_output(out: Path, *inputs: Path) -> None:
         return
     if out.is_dir():
         raise ImportDriveError(f"{out}: is a folder; name the file of the drive")
-    for path in _files(inputs):
+    for path in input_files(inputs):
         if out.exists() and path.exists() and out.samefile(path):
             raise ImportDriveError(f"{out}: is the input {path}; an import never writes over its input: name another")
     if not _is_drive(out):
         raise ImportDriveError(f"{out}: exists and is no drive; only an older drive is replaced: name another file")
 
 
-def _files(inputs: tuple[Path, ...]) -> Iterator[Path]:
+def input_files(inputs: tuple[Path, ...]) -> Iterator[Path]:
+    """Every file of these files and folders."""
     for place in inputs:
         if place.is_dir():
             yield from (Path(folder, name) for folder, _, names in os.walk(place, followlinks=True) for name in names)

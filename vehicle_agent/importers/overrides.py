@@ -11,6 +11,7 @@ from gnd.vehicle_agent.importers.attached_poses import with_poses
 from gnd.vehicle_agent.importers.choices import METRES_OF, Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.mounting import moved
+from gnd.vehicle_agent.importers.ouster.capture import metadata_named
 from gnd.vehicle_agent.importers.recording import Recording
 
 
@@ -18,7 +19,7 @@ def as_chosen(recording: Recording, folder: Path, choices: Choices) -> Recording
     """The recording with another unit, sensor, mount or track than its reader found."""
     if choices.unit != "m":
         recording = _scaled(recording, METRES_OF[choices.unit])
-    if choices.sensor is not None:
+    if choices.sensor is not None and metadata_named(choices) is None:
         recording = replace(recording, sensor_model=choices.sensor)
     if choices.mount is not None:
         recording = _mounted(recording, choices)

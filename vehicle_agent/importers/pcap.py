@@ -1,4 +1,5 @@
-"""Captures of a Velodyne's packets (pcap): decoded by `velodyne-decoder`, with the times of the packets.
+"""Captures of packets (pcap): a Velodyne's, decoded by `velodyne-decoder` with the times of the packets, an Ouster's by
+`ouster.capture`. Which it is is known by the lengths of the packets.
 
 VLP-16, Puck Hi-Res, VLP-32C, HDL-32E and HDL-64E S2/S3 are known by their packets. The first and last turn are cut off
 by the capture and are left out. Positions in a capture (GPRMC) have no height, so a place must be given. Packets of
@@ -6,6 +7,7 @@ other sensors are refused with what to do.
 """
 
 import weakref
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, Final
@@ -16,19 +18,20 @@ from numpy.typing import NDArray
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.files import files_below
 from gnd.vehicle_agent.importers.optional import library
+from gnd.vehicle_agent.importers.ouster.capture import UdpStreams, metadata_named, open_ouster
+from gnd.vehicle_agent.importers.ouster.packets import kinds_of_size
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
 
 EXTRA: Final = "import"
 MAGICS: Final = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
 VELODYNE_BYTES: Final = 1206
+POSITION_BYTES: Final = 512
 FULL: Final = 0.8
 """A turn with less than this share of the usual points was cut off by the capture."""
 _POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("offset", "<u4"), ("ring", "<u2")])
-_ADVICE: Final = (
-    "Ouster: `ouster-cli source FILE.pcap save BAG` (ouster-sdk in an environment of its own); other sensors: replay it"
-    " through the sensor's ROS 2 driver; then import the bag of its points"
-)
+_ADVICE: Final = "replay it through the sensor's ROS 2 driver, then import the bag of its points"
 
 
 def is_pcap(head: bytes) -> bool:
@@ -39,21 +42,37 @@ def is_pcap(head: bytes) -> bool:
 def open_pcap(path: Path, anchor: RecordingAnchor | None, choices: Choices | None = None) -> Recording:
     """A capture; `anchor` says where on the Earth the first pose lies.
 
+    A folder is the capture that lies in it.
+
     Raises:
-        ImportDriveError: no packets of a Velodyne, or a damaged file.
+        ImportDriveError: no packets of a sensor that is read, no metadata of an Ouster, or a damaged file.
         MissingExtra: velodyne-decoder is not installed.
     """
-    sizes = _sizes(path)
-    if VELODYNE_BYTES not in sizes:
-        held = ", ".join(f"{n} of {size} bytes" for size, n in sorted(sizes.items(), key=lambda one: -one[1])[:4])
+    path = _file(path)
+    streams = UdpStreams.of(path)
+    sizes = streams.by_size
+    if not sizes:
+        reason = streams.capture.damaged or f"no whole UDP packet, {streams.capture.incomplete} in part"
+        raise ImportDriveError(f"{path}: no readable capture: {reason}")
+    is_velodyne = VELODYNE_BYTES in sizes and (choices is None or metadata_named(choices) is None)
+    if not is_velodyne:
+        ouster = open_ouster(path, streams, anchor, choices)
+        if ouster is not None:
+            return ouster
+        held = ", ".join(f"{n} of {size} bytes" for size, n in sizes.most_common(4))
         raise ImportDriveError(
-            f"{path}: no packets of a Velodyne ({VELODYNE_BYTES} bytes) but {held or 'none'}. {_ADVICE}"
+            f"{path}: no packets of a Velodyne ({VELODYNE_BYTES} bytes) or an Ouster but {held}. {_ADVICE}"
         )
-    store = _Turns(path, strict=choices is not None and choices.strict)
+    return _open_velodyne(path, sizes, anchor, strict=choices is not None and choices.strict)
+
+
+def _open_velodyne(path: Path, sizes: Mapping[int, int], anchor: RecordingAnchor | None, *, strict: bool) -> Recording:
+    """The turns of a Velodyne; `sizes`: packets of each length."""
+    store = _Turns(path, strict=strict)
     t_ns = np.array([begin for begin, _, _ in store.index], np.int64)
     cut_off = (f"{store.left_out} turns cut off by the capture: left out",) if store.left_out else ()
     others = tuple(
-        Entry(f"{size} bytes", "UDP packets", n, "", "", "positions without a height" if size == 512 else "")
+        Entry(f"{size} bytes", "UDP packets", n, "", "", _why_not(size))
         for size, n in sizes.items() if size != VELODYNE_BYTES
     )  # fmt: skip
     return Recording(
@@ -74,17 +93,25 @@ def open_pcap(path: Path, anchor: RecordingAnchor | None, choices: Choices | Non
     )
 
 
-def _sizes(path: Path) -> dict[int, int]:
-    """How many UDP payloads of each size a capture holds."""
-    util = library("velodyne_decoder.util", EXTRA)
-    sizes: dict[int, int] = {}
-    try:
-        for _, data in util.iter_pcap(str(path)):
-            sizes[len(data)] = sizes.get(len(data), 0) + 1
-    except Exception as error:
-        if not sizes:
-            raise ImportDriveError(f"{path}: no readable capture: {' '.join(str(error).split())[:200]}") from error
-    return sizes
+def _why_not(size: int) -> str:
+    if size == POSITION_BYTES:
+        return "positions without a height"
+    return "an Ouster's: --sensor FILE.json with its metadata reads it instead" if kinds_of_size(size) else ""
+
+
+def _file(path: Path) -> Path:
+    """The capture itself.
+
+    Raises:
+        ImportDriveError: a folder with several.
+    """
+    if path.is_file():
+        return path
+    found = files_below(path, ".pcap", ".pcapng")
+    if len(found) != 1:
+        names = ", ".join(one.name for one in found[:4])
+        raise ImportDriveError(f"{path}: {len(found)} captures ({names}): name one of them")
+    return found[0]
 
 
 class _Turns:

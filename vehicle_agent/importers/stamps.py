@@ -14,7 +14,7 @@ from gnd.vehicle_agent.importers.trajectories.clocks import ns_of_number
 _STAMP: Final = re.compile(r"(\d{9,10}[._]\d{3,9}|\d{13}|\d{16}|\d{18,19})(?=\.|_|$)")
 
 
-class Stamped(Protocol):
+class HasStamp(Protocol):
     """Where a cloud lies, and when it was stamped."""
 
     @property
@@ -22,7 +22,7 @@ class Stamped(Protocol):
         """UTC."""
 
 
-At = TypeVar("At", bound=Stamped)
+At = TypeVar("At", bound=HasStamp)
 
 
 def in_time_order(clouds: list[At]) -> tuple[list[At], tuple[str, ...]]:

@@ -6,10 +6,8 @@ from typing import Any
 import click
 from rich.console import Console
 
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import tables
-from gnd.tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
+from gnd.tile_store.cli import PATH, json_option, layer_option, show
 from gnd.tile_store.options import bars
 from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
@@ -31,7 +29,8 @@ def align(
     context: click.Context, a: Path, b: Path, out: Path | None, shift_m: float, turn_deg: float, picture: Path | None,
     codec: str, layer: str, as_json: bool,
 ) -> None:  # fmt: skip
-    """Find where B lies on A, both a map (store) or a drive (MCAP), from where their GNSS puts them.
+    """Find where B lies on A, both a map (store) or a drive (MCAP), from where their GNSS puts them. One of them may be
+    a vector HD map (Lanelet2, OpenDRIVE, GeoJSON): its poles, lamps and signs are laid on the posts of the other.
 
     A stays. Exit status 1, and nothing is written, when B does not fit: too little overlap, more than one place,
     residuals too high, or B is bent against A.
@@ -40,16 +39,30 @@ def align(
     from gnd.vehicle_agent.map_align.align import align_clouds
     from gnd.vehicle_agent.map_align.candidates import Reach
     from gnd.vehicle_agent.map_align.cloud import cloud_of_tiles
-    from gnd.vehicle_agent.map_align.move import moved_drive, moved_tiles
-    from gnd.vehicle_agent.map_align.sources import AlignError, open_side
+    from gnd.vehicle_agent.map_align.move import moved_drive, write_moved
+    from gnd.vehicle_agent.map_align.posts import is_vector_map
+    from gnd.vehicle_agent.map_align.sources import AlignError, frame_of, open_side
+    from gnd.vehicle_agent.map_align.vector import align_vector
 
     if out is not None and out.exists():
         raise AlignError(f"{out} exists; --out writes a new file")
+    reach = Reach(shift_m, turn_deg, max(shift_m, 5.0))
+    if is_vector_map(a) or is_vector_map(b):
+        if picture is not None:
+            raise AlignError("--picture draws two LiDAR maps; of an HD map it draws nothing")
+        with bars() as progress:
+            posts = align_vector(a, b, layer, reach, progress, writes=out is not None)
+            written = posts.write(out, codec, layer) if out is not None and posts.found.fits else None
+        values = posts.as_dict() | {"written": str(written) if written else None}
+        show(values, as_json, lambda console: _print_posts(console, values))
+        if not posts.found.fits:
+            context.exit(REFUSED)
+        return
     with bars() as progress:
         sides = [open_side(path, layer, progress) for path in (a, b)]
-        frame = LocalFrame.of_tile(middle_tile([tile.tile_id for tile in sides[1].tiles]))
+        frame = frame_of(sides[1])
         cloud_a, cloud_b = (cloud_of_tiles(side.tiles, frame) for side in sides)
-        found = align_clouds(cloud_a, cloud_b, Reach(shift_m, turn_deg, max(shift_m, 5.0)), progress)
+        found = align_clouds(cloud_a, cloud_b, reach, progress)
     if picture is not None:
         from gnd.vehicle_agent.map_align.picture import draw_alignment
 
@@ -58,21 +71,12 @@ def align(
         if sides[1].kind == "drive":
             moved_drive(b, out, frame, found.T_a_b, f"moved onto {a.name} by gnd map align: {_motion(found)}")
         else:
-            tiles = moved_tiles(sides[1], frame, found.T_a_b, codec)
-            with store_to_fill(out) as store:
-                store.put_tiles(tiles, layer=layer, surveyed_ns=sides[1].surveyed_ns)
+            write_moved(sides[1], out, frame, found.T_a_b, codec, layer)
     values = {"a": str(a), "b": str(b), "frame": {"lat_rad": frame.lat_rad, "lon_rad": frame.lon_rad}}
     values |= found.as_dict() | {"written": str(out) if out is not None and found.fits else None}
     show(values, as_json, lambda console: _print(console, values))
     if not found.fits:
         context.exit(REFUSED)
-
-
-def middle_tile(tiles: list[TileId]) -> TileId:
-    """The tile nearest to the middle of all, by its indices."""
-    east = sorted(tile.lon_index for tile in tiles)[len(tiles) // 2]
-    north = sorted(tile.lat_index for tile in tiles)[len(tiles) // 2]
-    return TileId.from_indices(east, north)
 
 
 def _motion(found: Any) -> str:
@@ -91,6 +95,23 @@ def _print(console: Console, values: dict[str, Any]) -> None:
         "residual": f"{100 * residual['p50']:.1f} cm (median), {100 * residual['p90']:.1f} cm (p90)",
         "second best place": f"{100 * values['second_best']['worth']:.0f} % of the best",
         "parts off their place": f"at most {100 * values['bend_m']:.1f} cm in 85 % of {len(values['blocks'])} blocks",
+    }
+    console.print(tables.fields(f"{values['b']} on {values['a']}", plain))
+    for reason in values["reasons"]:
+        console.print(f"does not fit: {reason}", style="red", highlight=False)
+    if values["fits"]:
+        console.print("fits" + (f", written: {values['written']}" if values["written"] else ""), highlight=False)
+
+
+def _print_posts(console: Console, values: dict[str, Any]) -> None:
+    shift, posts = values["shift_m"], values["posts"]
+    plain = {name: f"{shift[name]:.3f} m, sigma {100 * values['sigma_m']:.1f} cm" for name in ("east", "north")} | {
+        "up": "not compared",
+        "heading": f"{values['heading_deg']:.3f} degrees, sigma {values['sigma_deg']:.3f}",
+        "posts": f"{posts['matched']} of {posts['seen']} of the HD map that the LiDAR map should hold",
+        "residual": f"{100 * values['residual_m']:.1f} cm (median)",
+        "second best place": f"{100 * values['second_best']:.0f} % of the best",
+        "mirror image": f"{100 * values['mirror_image']:.0f} % of the best",
     }
     console.print(tables.fields(f"{values['b']} on {values['a']}", plain))
     for reason in values["reasons"]:

@@ -17,6 +17,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import GnssFix, ReferencePose
 from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.tile_store.cli import store_to_fill
 from gnd.tile_store.values import DEFAULT_CODEC, lattice_named
 from gnd.vehicle_agent.importers.rigid import orthonormal
 from gnd.vehicle_agent.map_align.sources import AlignError, Side
@@ -55,6 +56,13 @@ def moved_drive(source: Path, target: Path, frame: LocalFrame, T_a_b: F64, why: 
                     writer.gnss(_moved_fix(item, frame, T_a_b))
                 case _:
                     writer.add(item)
+
+
+def write_moved(side: Side, target: Path, frame: LocalFrame, T_a_b: F64, codec: str, layer: str) -> None:
+    """Write a map, moved, into a new store."""
+    tiles = moved_tiles(side, frame, T_a_b, codec)
+    with store_to_fill(target) as store:
+        store.put_tiles(tiles, layer=layer, surveyed_ns=side.surveyed_ns)
 
 
 def _moved_fix(fix: GnssFix, frame: LocalFrame, T: F64) -> GnssFix:

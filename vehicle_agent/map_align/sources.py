@@ -6,7 +6,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, Literal
 
+from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive_mcap import drive_counts
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.options import to_read
@@ -57,6 +59,14 @@ def open_side(path: Path, layer: str, progress: Callable[[str, int, int], None])
         return _read(path, kind, store, layer)
 
 
+def frame_of(side: Side) -> LocalFrame:
+    """ENU in the tile that is nearest to the middle of all, by its indices."""
+    tiles = [tile.tile_id for tile in side.tiles]
+    east = sorted(tile.lon_index for tile in tiles)[len(tiles) // 2]
+    north = sorted(tile.lat_index for tile in tiles)[len(tiles) // 2]
+    return LocalFrame.of_tile(TileId.from_indices(east, north))
+
+
 def _kind_of(path: Path) -> Literal["map", "drive"]:
     try:
         with path.open("rb") as file:
@@ -66,7 +76,9 @@ def _kind_of(path: Path) -> Literal["map", "drive"]:
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return "map" if kind == "map" else "drive"
-    raise AlignError(f"{path} is neither a map (`gnd map build`) nor a drive (MCAP, `gnd import`)")
+    raise AlignError(
+        f"{path} is neither a map (`gnd map build`), a drive (MCAP, `gnd import`) nor an HD map (.osm, .xodr, .geojson)"
+    )
 
 
 def _read(path: Path, kind: Literal["map", "drive"], store: SqliteStore, layer: str = DEFAULT_LAYER) -> Side:

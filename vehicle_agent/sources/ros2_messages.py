@@ -32,14 +32,15 @@ class BadRosMessage(VehicleError):
 
 
 @cache
-def _store() -> Any:
+def type_store() -> Any:
+    """The types that are known, by `rosbags`; MissingExtra: it is not installed."""
     types = library("rosbags.typesys", "ros")
     return types.get_typestore(types.Stores.ROS2_JAZZY)
 
 
 def type_hash(type_name: str) -> str:
     """The hash of a type (REP 2016), such as "RIHS01_df66…", by which rmw_zenoh keys it."""
-    return str(_store().hash_rihs01(type_name))
+    return str(type_store().hash_rihs01(type_name))
 
 
 def decode(type_name: str, cdr: bytes) -> Any:
@@ -49,7 +50,7 @@ def decode(type_name: str, cdr: bytes) -> Any:
         BadRosMessage: cut off, or bytes of something else.
     """
     try:
-        return _store().deserialize_cdr(cdr, type_name)
+        return type_store().deserialize_cdr(cdr, type_name)
     except Exception as error:  # the library raises what its generated code meets: IndexError, struct.error, ...
         raise BadRosMessage(f"{len(cdr)} bytes are no {type_name}: {error}") from error
 
@@ -61,11 +62,11 @@ def encode(type_name: str, values: Mapping[str, Any]) -> bytes:
         type_name: such as `FIX`.
         values: by field; of a message in the message again a mapping, of several a list of them.
     """
-    return bytes(_store().serialize_cdr(_filled(type_name, values), type_name))
+    return bytes(type_store().serialize_cdr(_filled(type_name, values), type_name))
 
 
 def _filled(type_name: str, values: Mapping[str, Any]) -> SimpleNamespace:
-    fields = _store().fielddefs[type_name][1]
+    fields = type_store().fielddefs[type_name][1]
     unknown = set(values) - {name for name, _ in fields}
     if unknown:
         raise BadRosMessage(f"{type_name} has no field {', '.join(sorted(unknown))}")
@@ -100,13 +101,18 @@ def header(t_ns: int, frame_id: str) -> dict[str, Any]:
 
 def cloud_message(t_ns: int, frame_id: str, points: np.ndarray[Any, np.dtype[np.void]]) -> bytes:
     """A PointCloud2 of packed points: (N,) structured, each field one number."""
+    return encode(CLOUD, cloud_values(t_ns, frame_id, points))
+
+
+def cloud_values(t_ns: int, frame_id: str, points: np.ndarray[Any, np.dtype[np.void]]) -> dict[str, Any]:
+    """A PointCloud2 for `encode`, of packed points: (N,) structured, each field one number."""
     dtype = points.dtype
     fields = [
         {"name": name, "offset": dtype.fields[name][1], "datatype": _FIELD_CODES[dtype[name].str[1:]], "count": 1}
         for name in dtype.names or ()
         if dtype.fields is not None
     ]
-    values = {
+    return {
         "header": header(t_ns, frame_id),
         "height": 1,
         "width": len(points),
@@ -116,7 +122,6 @@ def cloud_message(t_ns: int, frame_id: str, points: np.ndarray[Any, np.dtype[np.
         "data": np.frombuffer(points.tobytes(), np.uint8),
         "is_dense": True,
     }
-    return encode(CLOUD, values)
 
 
 def scan_message(scan: Scan, frame_id: str) -> bytes:

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from export_testing import Ndt, OnTiles, PlaneFrame, apart, beside, read_cell, read_export, scans_of, vgicp
 from map_export_maps import TILE, some_tile
+from service_localising import check_drive
 
 from gnd.deploy.map_export import autoware
 from gnd.deploy.map_export.autoware import CLOUDS, METADATA, PROJECTOR, export_autoware, read_metadata
@@ -291,10 +292,12 @@ def test_localisers_find_the_same_pose_on_a_simulated_street(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_localisers_find_the_same_pose_on_a_real_street(shared_data: Path, tmp_path: Path) -> None:
+def test_localisers_find_the_same_pose_on_a_real_street(shared_data: Path, tmp_path: Path, free_port: int) -> None:
+    """And one that gets its cells from the map service."""
     import_recording("kitti", shared_data / "kitti00_start16", tmp_path / "whole.mcap", anchor=NOMINAL)
     rewrite_drive(tmp_path / "whole.mcap", tmp_path / "mapped.mcap", [], slice(0, None, 2))
     rewrite_drive(tmp_path / "whole.mcap", tmp_path / "driven.mcap", [], slice(1, None, 2))
     with SqliteStore(tmp_path / "base.sqlite") as opened:
         build_map([tmp_path / "mapped.mcap"], opened)
     check_poses(localised(tmp_path, tmp_path / "driven.mcap", 1))
+    check_drive(tmp_path, tmp_path / "driven.mcap", 1, 2.0, free_port)

@@ -1,0 +1,1 @@
+"""Packets of Ouster's sensors: metadata, layout of packets, frames, points."""
