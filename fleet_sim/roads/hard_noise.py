@@ -74,11 +74,11 @@ class HardNoise:
     profile_missing: float = 0.05
 
     def __post_init__(self) -> None:
-        sigmas = (self.sign_range_share, self.sign_bearing_rad, self.yaw_rad, self.range_share, self.pitch_rad)
-        sigmas += (self.white_ln_sigma, self.lookalikes_per_km, self.profile_m, self.profile_rad)
-        shares = (self.miss_near, self.miss_far, self.least_seen, self.confused, self.confused_signs)
-        shares += (self.confused_often, self.lookalike_seen, *self.lookalike_rate, self.lookalike_kind)
-        shares += (self.profile_dropped, self.profile_missing)
+        sigmas = [self.sign_range_share, self.sign_bearing_rad, self.yaw_rad, self.range_share, self.pitch_rad]
+        sigmas += [self.white_ln_sigma, self.lookalikes_per_km, self.profile_m, self.profile_rad]
+        shares = [self.miss_near, self.miss_far, self.least_seen, self.confused, self.confused_signs]
+        shares += [self.confused_often, self.lookalike_seen, *self.lookalike_rate, self.lookalike_kind]
+        shares += [self.profile_dropped, self.profile_missing]
         if min(sigmas) < 0.0 or not all(0.0 <= share <= 1.0 for share in shares):
             raise RoadError(f"hard noise needs sigmas >= 0 and shares within 0 … 1, got {self}")
         if self.miss_far < self.miss_near or self.lookalike_rate[0] > self.lookalike_rate[1]:
