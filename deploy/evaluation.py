@@ -38,11 +38,12 @@ class RunScores:
     after: Evaluation
 
     def as_dict(self) -> dict[str, Any]:
-        """Return macro F1 in percent: scored voxels by stage, and all three levels below `levels`."""
+        """Return macro F1 in percent: observable voxels by stage, and all three levels below `levels`."""
         levels = {level: self._stages(level) for level in LEVELS}
         return {
-            **levels["scored"],
+            **levels["observable"],
             "levels": levels,
+            "kept": self.after.kept,
             "single_by_vehicle": _by_vehicle(self.single),
             "helped_by_vehicle": _by_vehicle(self.helped),
         }
@@ -57,7 +58,7 @@ class RunScores:
 
 
 def _by_vehicle(scores: dict[str, Evaluation]) -> dict[str, float]:
-    return {name: round(score.f1("scored"), 2) for name, score in sorted(scores.items())}
+    return {name: round(score.f1("observable"), 2) for name, score in sorted(scores.items())}
 
 
 NO_TRUTH: dict[str, Any] = {"before": None, "single": None, "after": None}

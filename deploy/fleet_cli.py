@@ -24,6 +24,7 @@ from gnd.extras import need_all
 from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.fleet_bus.settings_options import settings_options
+from gnd.fleet_sim.families.names import FAMILY_NAMES
 from gnd.gnd_map.settings import settings_text
 
 PATH = click.Path(path_type=Path)
@@ -54,6 +55,8 @@ RUN_OPTIONS = (
         help="Seconds between the starts of two vehicles, in time of the drives; 0: all at once.  [default: 4]",
     ),
     click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]"),
+    click.option("--family", type=click.Choice(FAMILY_NAMES), help="Kind of place.  [default: street]"),
+    click.option("--parking", type=float, help="Share of parking slots that are taken.  [default: the family's]"),
     click.option(
         "--wrong-mount",
         "wrong_mounts",

@@ -11,6 +11,7 @@ from typing import Any
 
 from gnd.deploy.errors import DeployError
 from gnd.fleet_bus.settings_file import layers_of
+from gnd.fleet_sim.families.names import FAMILY_NAMES
 from gnd.gnd_map.settings import check_settings, from_settings, merged, setting
 from gnd.schemas.feature_layer import LayerParameters, checked_layers
 
@@ -39,6 +40,12 @@ class FleetConfig:
         most=MAX_HEADWAY_S,
     )
     world_seed: int = setting(7, "Seed of the simulated world and of its drives.")
+    family: str = setting(
+        "street", "Kind of place of the simulated world: street, suburb, avenue, ... (docs/worlds.md)."
+    )
+    parking: float | None = setting(
+        None, "Share of parking slots that are taken on each drive; by default the family's usual one.", least=0, most=1
+    )
     port: int = setting(0, "TCP port of the router on the loopback interface; 0 takes a free one.", least=0, most=65535)
     deadline_s: float = setting(1800.0, "A run that takes longer is ended with an error.", unit="s", above=0)
     wrong_mounts: tuple[str, ...] = setting(
@@ -61,6 +68,7 @@ class FleetConfig:
         """Refuse values outside their range."""
         check_settings(self, DeployError)
         _ = self.wrong_mounts_rad
+        _require(self.family in FAMILY_NAMES, f"unknown family {self.family!r}, use one of {', '.join(FAMILY_NAMES)}")
         self._check_layers()
 
     def _check_layers(self) -> None:

@@ -19,6 +19,7 @@ from gnd.deploy.mounts import with_wrong_mounts
 from gnd.deploy.run_folder import RunFolder
 from gnd.deploy.source import Source
 from gnd.fleet_sim.prepare import prepare_fleet_run
+from gnd.fleet_sim.street import StreetOptions
 from gnd.schemas.drive_mcap import read_header
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -69,12 +70,13 @@ def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | Non
     Returns:
         One drive an agent, and the truth.
     """
-    home = folder.world if worlds is None else worlds / f"seed-{config.world_seed}"
+    street = StreetOptions(family=config.family, parking=config.parking)
+    home = folder.world if worlds is None else worlds / _world_name(config)
     forget_if_stale(home)
     forget_other_headways(home, config.headway_s)
     processes, headway_s = os.cpu_count() or 1, config.headway_s
     world = prepare_fleet_run(
-        config.world_seed, config.agents, home, progress, processes, reuse=True, headway_s=headway_s
+        config.world_seed, config.agents, home, progress, processes, reuse=True, headway_s=headway_s, street=street
     )
     base_map = home / "base.sqlite"
     if not base_map.exists():
@@ -84,6 +86,13 @@ def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | Non
         put_base_layers(folder.store, world.features_path, config.feature_layers)
     starts_s = starts_of(config.agents, headway_s)
     return PreparedRun(tuple(world.agent_drives), world.truth_path, starts_s, world.world_path)
+
+
+def _world_name(config: FleetConfig) -> str:
+    """Name of a kept world: all that decides it but the programs."""
+    family = "" if config.family == "street" else f"-{config.family}"
+    parking = "" if config.parking is None else f"-parking{100 * config.parking:g}"
+    return f"seed-{config.world_seed}{family}{parking}"
 
 
 def forget_if_stale(home: Path) -> None:

@@ -160,7 +160,9 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         )
     if f1["before"] is not None:
         lines.append(
-            f"map against the truth, macro F1: {f1['before']:.1f} % before, {_single_text(f1)}{f1['after']:.1f} % after"
+            f"map against the truth, macro F1 of observable voxels: {f1['before']:.1f} % before, "
+            f"{_single_text(f1)}{f1['after']:.1f} % after"
+            f" (all: {f1['levels']['all']['after']:.1f} %, scored: {f1['levels']['scored']['after']:.1f} %)"
         )
     lines += made_up_lines(summary.get("made_up"))
     lines += learning_lines(summary.get("learning", {}))

@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from gnd.fleet_sim.families.names import FAMILY_NAMES
+from gnd.fleet_sim.sensing import BEAMS, WEATHERS, Beams, Weather
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import SITES, StreetOptions, street
 from gnd.fleet_sim.world import STATES, World, read_world, write_world
@@ -30,12 +32,14 @@ def world() -> None:
 @click.option("--site", type=click.Choice(SITES), default="border", show_default=True, help="Where the street lies.")
 @click.option("--lat", "lat_deg", type=float, help="Latitude of its middle in degrees, instead of a site.")
 @click.option("--lon", "lon_deg", type=float, help="Longitude of its middle in degrees, instead of a site.")
+@click.option("--family", type=click.Choice(FAMILY_NAMES), default="street", show_default=True, help="Kind of place.")
+@click.option("--parking", type=float, help="Share of parking slots that are taken on its drives, 0 to 1.")
 @click.option("--edits", "edit_share", default=1.0, show_default=True, help="Share of the street's edits to make.")
 def write(file: Path, seed: int, **options: Any) -> None:
     """Write the street of a seed to FILE (JSON)."""
     made = street(seed, StreetOptions(**options))
     write_world(made, file)
-    click.echo(f"{file}: {len(made.objects)} objects, {options['length_m']:g} m, seed {seed}")
+    click.echo(f"{file}: {len(made.objects)} objects, {options['length_m']:g} m, {options['family']}, seed {seed}")
 
 
 @world.command("inspect")
@@ -62,7 +66,7 @@ def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
 
     made = read_world(file)
     truth = load_or_make_truth(made, truth_file) if truth_file else make_truth(made)
-    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}", _note(made), dpi=dpi)
+    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}{_family(made)}", _note(made), dpi=dpi)
     click.echo(f"{png}: {', '.join(f'{n} {name}' for name, n in truth.counts('all').items())}")
 
 
@@ -81,6 +85,10 @@ def features(file: Path, layers: Path, mapped_streetlights: float) -> None:
         click.echo(f"{layer}: {', '.join(f'{n} {state}' for state, n in states.items())}")
 
 
+def _family(made: World) -> str:
+    return "" if made.family == "street" else f", {made.family}"
+
+
 def _note(made: World) -> str:
     lat_deg, lon_deg = degrees(made.lat_rad), degrees(made.lon_rad)
     return f"what changes between before and after on {2 * made.half_length_m:g} m at {lat_deg:.4f}°, {lon_deg:.4f}°"
@@ -94,8 +102,10 @@ def _note(made: World) -> str:
 @click.option("--reverse", is_flag=True, help="Drive against the street's x.")
 @click.option("--seed", default=0, show_default=True, help="Seed of everything random in the drive.")
 @click.option("--vehicle", default="vehicle-0", show_default=True, help="Pseudonym of the vehicle.")
-@click.option("--cars", default=0.2, show_default=True, help="Share of parking slots that are taken.")
+@click.option("--cars", type=float, help="Share of parking slots that are taken.  [default: the world's, usually 0.2]")
 @click.option("--traffic", type=click.Choice(["none", "urban"]), default="none", show_default=True, help="Movers.")
+@click.option("--weather", type=click.Choice(WEATHERS), default="clear", show_default=True)
+@click.option("--beams", type=click.Choice(BEAMS), default="ideal", show_default=True, help="Real ones have a width.")
 @click.option("--scans", type=int, help="At most so many scans.")
 @click.option("--camera", is_flag=True, help="A camera that detects traffic signs, too.")
 def drive(
@@ -106,8 +116,10 @@ def drive(
     reverse: bool,
     seed: int,
     vehicle: str,
-    cars: float,
+    cars: float | None,
     traffic: str,
+    weather: Weather,
+    beams: Beams,
     scans: int | None,
     camera: bool,
 ) -> None:
@@ -126,6 +138,8 @@ def drive(
         traffic=Traffic.urban() if traffic == "urban" else Traffic(),
         scans=scans,
         camera=SignCamera() if camera else None,
+        weather=weather,
+        beams=beams,
     )
     simulate_drive(read_world(world_file), config, file)
     click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

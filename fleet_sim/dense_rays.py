@@ -28,11 +28,14 @@ AFTER_KEPT: Final = 4
 """Sub-cell hit after, on something that stood before."""
 AFTER_COME: Final = 8
 """Sub-cell hit after, on something that did not stand before."""
+LEAF_BEFORE: Final = 16
+"""Sub-cell hit before, on leaves or snow that are gone after; they count as standing: seasons change no map."""
+LEAF_AFTER: Final = 32
+"""Sub-cell hit after, on leaves or snow that were not there before; there is nothing, for a map."""
 
-_FLAGS: Final[dict[State, tuple[int, int]]] = {
-    "before": (BEFORE_KEPT, BEFORE_GONE),
-    "after": (AFTER_KEPT, AFTER_COME),
-}
+_KEPT: Final[dict[State, int]] = {"before": BEFORE_KEPT, "after": AFTER_KEPT}
+_CHANGED: Final[dict[State, int]] = {"before": BEFORE_GONE, "after": AFTER_COME}
+_SEASONAL: Final[dict[State, int]] = {"before": BEFORE_KEPT | LEAF_BEFORE, "after": LEAF_AFTER}
 _GOLDEN: Final = 0.6180339887498949
 _TIE_M: Final = 1e-9
 """Changed things are looked for so far behind a kept one: of two surfaces in one place, the first listed counts."""
@@ -67,9 +70,9 @@ class ScanPlan:
         """Return the scanner's places, float64 (K, 3), street frame."""
         reach = world.half_length_m - self.end_margin_m
         x = np.arange(-reach, reach + 1e-9, self.spacing_m)
-        lanes = [np.stack([x, np.full_like(x, side * world.lane_offset_m)], axis=1) for side in (-1, 1)]
+        lanes = [np.stack([x, side * world.lane_m(x)[0]], axis=1) for side in (-1, 1)]
         xy = np.concatenate(lanes)
-        return np.column_stack([xy, world.road_height_m(xy[:, 1]) + self.sensor_m])
+        return np.column_stack([xy, world.road_height_m(xy[:, 1], xy[:, 0]) + self.sensor_m])
 
     def directions_street(self, index: int) -> FloatArray:
         """Return unit ray directions, float64 (N, 3), of place `index`; its raster is shifted so as to fill gaps."""
@@ -96,10 +99,14 @@ class Shots(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """Things that are met together: a scene, none without things, and each primitive's rank in the lists of states."""
+    """Things that are met together: a scene, none without things, and each primitive's rank in the lists of states.
+
+    `flags` uint8: what a hit on each primitive says, of things that stand in one state only.
+    """
 
     scene: Scene | None
     ranks: dict[State, IntArray]
+    flags: NDArray[np.uint8]
 
 
 def shots(world: World, plan: ScanPlan) -> Iterator[Shots]:
@@ -114,7 +121,12 @@ def shots(world: World, plan: ScanPlan) -> Iterator[Shots]:
         reach_m = np.minimum(common[0] + _TIE_M, plan.range_m)
         casts = [
             _nearer(
-                *common, kept.ranks[state], *_cast(part, start, directions, reach_m), part.ranks[state], *_FLAGS[state]
+                *common,
+                kept.ranks[state],
+                *_cast(part, start, directions, reach_m),
+                part.ranks[state],
+                _KEPT[state],
+                part.flags,
             )
             for state, part in changed.items()
         ]
@@ -125,11 +137,13 @@ def shots(world: World, plan: ScanPlan) -> Iterator[Shots]:
 
 def _part(world: World, states: tuple[State, ...]) -> _Part:
     """Everything that stands in exactly these states."""
-    shapes: list[Shape] = [shape for o in world.objects if set(o.states) == set(states) for shape in o.shapes]
+    mine = [o for o in world.objects if set(o.states) == set(states)]
+    shapes: list[Shape] = [shape for o in mine for shape in o.shapes]
+    says = [(_SEASONAL if o.edit == "seasonal" else _CHANGED)[states[0]] for o in mine for _ in o.shapes]
     sparse = len(states) < len(STATES)
     room = {"cell_m": _SPARSE_CELL_M, "margin_m": 2 * world.half_length_m + world.kerb_m} if sparse else {}
     ranks = {state: _ranks(world, state, states) for state in states}
-    return _Part(Scene.build(shapes, world.A_street_map, **room) if shapes else None, ranks)
+    return _Part(Scene.build(shapes, world.A_street_map, **room) if shapes else None, ranks, np.array(says, np.uint8))
 
 
 def _ranks(world: World, state: State, states: tuple[State, ...]) -> IntArray:
@@ -168,7 +182,7 @@ def _nearer(
     part_index: IntArray,
     part_ranks: IntArray,
     kept_flag: int,
-    part_flag: int,
+    part_flags: NDArray[np.uint8],
 ) -> tuple[FloatArray, NDArray[np.uint8]]:
     """The nearer of two ends of each of N rays, and the flag of what is met there (0: nothing).
 
@@ -180,7 +194,7 @@ def _nearer(
         if j < 0 or kept_m[n] < part_m[n] or (kept_m[n] == part_m[n] and kept_ranks[i] < part_ranks[j]):
             ranges[n], flags[n] = kept_m[n], (kept_flag if i >= 0 else 0)
         else:
-            ranges[n], flags[n] = part_m[n], part_flag
+            ranges[n], flags[n] = part_m[n], part_flags[j]
     return ranges, flags
 
 

@@ -12,7 +12,17 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.fleet_sim.dense_rays import AFTER_COME, AFTER_KEPT, BEFORE_GONE, BEFORE_KEPT, ScanPlan, Shots, shots
+from gnd.fleet_sim.dense_rays import (
+    AFTER_COME,
+    AFTER_KEPT,
+    BEFORE_GONE,
+    BEFORE_KEPT,
+    LEAF_AFTER,
+    LEAF_BEFORE,
+    ScanPlan,
+    Shots,
+    shots,
+)
 from gnd.fleet_sim.errors import TruthError
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.accumulate import VoxelAccumulator
@@ -26,6 +36,9 @@ __all__ = [
     "AFTER_KEPT",
     "BEFORE_GONE",
     "BEFORE_KEPT",
+    "LEAF_AFTER",
+    "LEAF_BEFORE",
+    "SEASONAL",
     "DenseScan",
     "DenseWindow",
     "ScanPlan",
@@ -37,6 +50,9 @@ FloatArray = NDArray[np.float64]
 KNOWN_BEFORE: Final = BEFORE_KEPT | BEFORE_GONE
 STANDS_AFTER: Final = BEFORE_KEPT | AFTER_KEPT | AFTER_COME
 """What an ideal map holds after: all that was ever seen and still stands."""
+
+SEASONAL: Final = LEAF_BEFORE | LEAF_AFTER
+"""Leaves and snow of either state."""
 
 CELLS: Final = 10
 """Sub-cells of a voxel along each axis."""

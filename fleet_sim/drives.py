@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.fleet_sim.camera import Sightings, SignCamera, look_times_ns, looks_of, sightings
-from gnd.fleet_sim.cars import parked_cars
+from gnd.fleet_sim.cars import MAX_STAY_H, Stays, parked_cars
 from gnd.fleet_sim.errors import DriveSimError
 from gnd.fleet_sim.lidar import Lidar, column_poses
 from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensing import BEAMS, WEATHERS, Beams, Disturbance, Weather
 from gnd.fleet_sim.sensors import MODELS, LidarModel
 from gnd.fleet_sim.stage import Stage
 from gnd.fleet_sim.traffic import Traffic, movers_of
@@ -24,6 +25,7 @@ from gnd.schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, Motio
 from gnd.schemas.drive_mcap import DriveWriter
 
 _NS_PER_S: Final = 1_000_000_000
+_NS_PER_H: Final = 3_600 * _NS_PER_S
 EPOCH_NS: Final = 1_570_838_400 * _NS_PER_S
 """12 October 2019, 00:00 UTC, the day of the GND paper's 38 drives (section 7.1)."""
 Labels = Callable[[int, NDArray[np.bool_]], None]
@@ -78,8 +80,8 @@ class DriveConfig:
         state: the world's state that it drives through.
         direction: +1 along the street, -1 against it.
         seed: everything random of this drive.
-        cruise_mps: speed once under way.
-        car_share: share of parking slots that are taken.
+        cruise_mps: speed once under way; None: as usual in the world.
+        car_share: share of parking slots and bays that are taken; None: as usual in the world.
         scans: at most so many scans, None for the whole street.
         gnss_hz: rate of the GNSS.
         errors: of the vehicle's sensors.
@@ -87,6 +89,10 @@ class DriveConfig:
         traffic: moving cars and people; none by default.
         mount_height_m: height of the LiDAR over the road, None for the usual one of the model.
         camera: a camera that detects traffic signs; None for none.
+        weather: rain disturbs the LiDAR, see `gnd.fleet_sim.sensing`.
+        beams: "real" ones have a width.
+        stay_h: parked cars stay for so many hours on the average, and two drives through a world meet the same ones
+            if the time between them is short; 0: every drive meets others.
     """
 
     vehicle: str
@@ -94,8 +100,8 @@ class DriveConfig:
     state: State = "after"
     direction: Direction = 1
     seed: int = 0
-    cruise_mps: float = 9.0
-    car_share: float = 0.2
+    cruise_mps: float | None = None
+    car_share: float | None = None
     scans: int | None = None
     gnss_hz: int = 10
     errors: SensorErrors = field(default_factory=SensorErrors)
@@ -103,12 +109,19 @@ class DriveConfig:
     traffic: Traffic = field(default_factory=Traffic)
     mount_height_m: float | None = None
     camera: SignCamera | None = None
+    weather: Weather = "clear"
+    beams: Beams = "ideal"
+    stay_h: float = 0.0
 
     def __post_init__(self) -> None:
         if self.sensor not in MODELS:
             raise DriveSimError(f"unknown sensor {self.sensor!r}, known are {', '.join(MODELS)}")
         if self.direction not in (1, -1):
             raise DriveSimError(f"direction must be 1 or -1, got {self.direction}")
+        if self.weather not in WEATHERS or self.beams not in BEAMS:
+            raise DriveSimError(f"unknown weather {self.weather!r} or beams {self.beams!r}: {WEATHERS}, {BEAMS}")
+        if not 0.0 <= self.stay_h <= MAX_STAY_H:
+            raise DriveSimError(f"stay_h must be in 0 … {MAX_STAY_H:g}, got {self.stay_h}")
         if not 1 <= self.gnss_hz <= _MOTION_HZ:
             raise DriveSimError(f"gnss_hz must be in 1 … {_MOTION_HZ}, got {self.gnss_hz}")
 
@@ -166,19 +179,24 @@ class DriveSimulation:
         self._config = config
         self._world = world
         self._rng = np.random.default_rng([config.seed, world.seed])
-        style = DrivingStyle.drawn(self._rng, config.cruise_mps)
+        style = DrivingStyle.drawn(self._rng, world.cruise_mps if config.cruise_mps is None else config.cruise_mps)
         self.motion, duration_s = lane_motion(world, style, config.direction)
         whole = int(duration_s * config.model.rate_hz)
         self.scans = whole if config.scans is None else min(whole, config.scans)
         if self.scans < 1:
             raise DriveSimError(f"a drive needs at least one scan, got {self.scans} ({duration_s:.2f} s of street)")
-        cars = parked_cars(world, config.state, config.car_share, config.seed)
+        share = world.parking if config.car_share is None else config.car_share
+        since_h = (config.start_ns - EPOCH_NS) / _NS_PER_H
+        cars = parked_cars(world, config.state, share, config.seed, Stays(config.stay_h, since_h))
         shapes = (*world.shapes(config.state), *cars)
         self._scene = Scene.build(shapes, world.A_street_map)
         stage = Stage(world, shapes, self._scene, self.motion, self._seconds, config.seed)
         self.movers = movers_of(config.traffic, stage)
         self._lidar = Lidar(config.model)
         self._T_vehicle_lidar_true = self._drawn_mount()
+        seed = (config.seed, world.seed)
+        disturbance = Disturbance(world, config.state, config.weather, config.beams, seed)
+        self._disturbance = disturbance if disturbance.acts else None
 
     @property
     def _seconds(self) -> float:
@@ -226,7 +244,7 @@ class DriveSimulation:
         T_map_lidar = column_poses(
             self._config.model, t_s, lambda t: self.motion.T_map_vehicle(t) @ self._T_vehicle_lidar_true
         )
-        sweep = self._lidar.sweep(self._scene, T_map_lidar, self._rng, self.movers, t_s)
+        sweep = self._lidar.sweep(self._scene, T_map_lidar, self._rng, self.movers, t_s, disturbance=self._disturbance)
         if on_labels is not None:
             on_labels(t_ns, self._moving(sweep.primitive, t_s + 0.5 / self._config.model.rate_hz))
         return Scan(t_ns, sweep.points_lidar_m, sweep.t_offset_ns, sweep.ring.astype(np.uint16))

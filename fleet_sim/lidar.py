@@ -17,6 +17,7 @@ from gnd.fleet_sim.errors import SceneError
 from gnd.fleet_sim.movers import Movers
 from gnd.fleet_sim.ray_kernels import FloatArray, IntArray, cast_sweep
 from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensing import Disturbance, Shots
 from gnd.fleet_sim.sensors import LidarModel
 from gnd.fleet_sim.shapes import reflectivity_of
 
@@ -113,10 +114,18 @@ class Lidar:
         movers: Movers | None = None,
         t_s: float = 0.0,
         foliage: Foliage | None = None,
+        disturbance: Disturbance | None = None,
     ) -> Sweep:
-        """Take one sweep with range noise and lost returns; arguments and errors as `hits`."""
+        """Take one sweep with range noise and lost returns; arguments and errors as `hits`.
+
+        `disturbance`: what glass, weather and the width of the beams do.
+        """
         hits = self.hits(scene, T_map_lidar, movers, t_s, foliage)
         packed = np.concatenate([part.packed for part in (scene, movers, foliage) if part is not None])
+        if disturbance is not None:
+            poses = np.ascontiguousarray(scene.A_street_map @ T_map_lidar[:, 0:3, :], dtype=np.float64)
+            shots = Shots(poses, self._directions, self._shares, self.model.range_max_m)
+            disturbance.disturb(scene, packed, shots, t_s, (hits.range_m, hits.primitive, hits.incidence))
         noisy = hits.range_m + self.model.range_sigma_m * rng.standard_normal(hits.range_m.shape)
         seen = self._seen(packed, hits, rng) & (noisy >= self.model.range_min_m) & (noisy <= self.model.range_max_m)
         points = self._directions[seen] * self._given(noisy[seen])[:, None]

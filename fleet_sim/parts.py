@@ -215,3 +215,19 @@ def car(x: float, y: float, base: float, yaw: float, style: int) -> tuple[Shape,
         for dy in (-wide + 0.1, wide - 0.1)
     ]
     return (body, top, *wheels)
+
+
+def delivery_van(x: float, y: float, base: float, yaw: float, style: int) -> tuple[Shape, ...]:
+    """Return a van with a high box, as it stands at a delivery zone: box, cab, four wheels."""
+    rng = np.random.default_rng(style)
+    half, wide, roof = rng.uniform(2.6, 3.2), rng.uniform(0.98, 1.08), rng.uniform(2.4, 3.0)
+    c, s = cos(yaw), sin(yaw)
+    box = Block(x - 0.5 * c, y - 0.5 * s, half - 0.6, wide, base + 0.55, base + roof, yaw, reflectivity=PLASTER)
+    front = half - 0.55
+    cab = Block(x + front * c, y + front * s, 0.55, wide - 0.05, base + 0.3, base + 1.95, yaw, reflectivity=METAL)
+    wheels = [
+        Block(x + dx * c - dy * s, y + dx * s + dy * c, 0.35, 0.12, base, base + 0.7, yaw, reflectivity=0.1)
+        for dx in (-0.6 * half, 0.65 * half)
+        for dy in (-wide + 0.12, wide - 0.12)
+    ]
+    return (box, cab, *wheels)

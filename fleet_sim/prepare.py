@@ -14,7 +14,8 @@ from gnd.fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, simulate_drive
 from gnd.fleet_sim.errors import SimError
 from gnd.fleet_sim.feature_files import write_feature_layers
 from gnd.fleet_sim.feature_truth import base_features, feature_truth
-from gnd.fleet_sim.street import street
+from gnd.fleet_sim.street import StreetOptions
+from gnd.fleet_sim.street import street as make_street
 from gnd.fleet_sim.trajectory import Direction
 from gnd.fleet_sim.truth import load_or_make_truth
 from gnd.fleet_sim.world import write_world
@@ -104,6 +105,7 @@ def prepare_fleet_run(
     *,
     reuse: bool = False,
     headway_s: float = 0.0,
+    street: StreetOptions | None = None,
 ) -> FleetWorld:
     """Make a world, its truth and all drives.
 
@@ -118,6 +120,7 @@ def prepare_fleet_run(
         scans: at most so many scans a drive, None for the whole street.
         reuse: keep the drives that are there; the caller vouches that this simulator made them for this world.
         headway_s: time between the starts of two vehicles, see `agent_configs`.
+        street: family, parking, length and place; by default the usual street.
 
     Returns:
         Where everything is.
@@ -133,7 +136,7 @@ def prepare_fleet_run(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SimError(f"cannot make the folder {folder}: {error}") from error
-    world = street(world_seed)
+    world = make_street(world_seed, street)
     write_world(world, out_dir / "world.json")
     write_feature_layers(base_features(feature_truth(world)), out_dir / FEATURES_FILE)
     paths = [folder / f"{config.vehicle}.mcap" for config in configs]

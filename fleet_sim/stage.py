@@ -52,7 +52,7 @@ class Stage:
 
     def ground_m(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height of the ground under points (S,) of the street [m], found by rays down from 1 m."""
-        eye = np.stack([x, y, np.full_like(x, _EYE_M)], axis=1)
+        eye = np.stack([x, y, _EYE_M + self.world.relief_m(x)], axis=1)
         down = np.tile([0.0, 0.0, -1.0], (len(x), 1))
         drop, _ = self.scene.cast(self.world.map_of_street(eye), down, 5.0)
-        return np.where(np.isfinite(drop), _EYE_M - drop, 0.0)
+        return np.where(np.isfinite(drop), eye[:, 2] - drop, self.world.relief_m(x))

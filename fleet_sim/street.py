@@ -5,15 +5,19 @@ Everything is drawn from the seed by named random streams: the same seed and opt
 a change to the furniture leaves the buildings where they are.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, isfinite, radians, sin
 from typing import Final, Literal, get_args
 
 import numpy as np
 
+from gnd.fleet_sim.courses.terrain import TerrainProfile, raised
 from gnd.fleet_sim.errors import WorldError
-from gnd.fleet_sim.street_before import CROWN, KERB_M, PAVEMENT_M, built, drawn_plan
-from gnd.fleet_sim.street_edits import partly_edited, rebuild
+from gnd.fleet_sim.families.catalogue import FAMILIES
+from gnd.fleet_sim.families.site import LANE_OFFSET_M as LANE_OFFSET_M
+from gnd.fleet_sim.families.site import FamilySite
+from gnd.fleet_sim.street_before import drawn_plan
+from gnd.fleet_sim.street_edits import partly_edited
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.geodesy import LocalFrame
 
@@ -25,7 +29,6 @@ BORDER_LON_RAD: Final = radians(894304 * 360.0 / 2**20 - 180.0)
 LAT_RAD: Final = radians(37.5597)
 HEIGHT_M: Final = 30.0
 LENGTH_M: Final = 200.0
-LANE_OFFSET_M: Final = 1.75
 MIN_LENGTH_M: Final = 100.0
 MAX_LENGTH_M: Final = 1000.0
 MAX_LAT_DEG: Final = 80.0
@@ -33,6 +36,7 @@ MAX_LAT_DEG: Final = 80.0
 _FIGURE_2_DEG: Final = (37.5595, 127.0363)
 _NORTH_49_DEG: Final = (49.0045, 8.4)
 _INSIDE_M: Final = 20.0
+_FAMILY_STREAM: Final = 0xFA311
 _STREAMS: Final = ("site", "lots", "furniture", "greenery", "edits", "more", "share")
 
 
@@ -47,6 +51,9 @@ class StreetOptions:
         lat_deg, lon_deg: middle of the street, WGS-84, instead of a site; both or neither.
         edit_share: so many of the street's edits are made, drawn from the seed one by one; the other things stay as
             they were. 1: all, a construction zone and its neighbourhood.
+        family: what kind of place it is, one of `families.catalogue.FAMILIES`.
+        parking: share of the parking slots and bays that are taken on a drive that says nothing else; None: as usual
+            in the family.
     """
 
     length_m: float = LENGTH_M
@@ -54,9 +61,15 @@ class StreetOptions:
     lat_deg: float | None = None
     lon_deg: float | None = None
     edit_share: float = 1.0
+    family: str = "street"
+    parking: float | None = None
 
     def __post_init__(self) -> None:
         numbers = [self.length_m, self.lat_deg or 0.0, self.lon_deg or 0.0, self.edit_share]
+        if self.family not in FAMILIES:
+            raise WorldError(f"unknown family {self.family!r}, use one of {', '.join(FAMILIES)}")
+        if self.parking is not None and not (isinstance(self.parking, (int, float)) and 0.0 <= self.parking <= 1.0):
+            raise WorldError(f"parking must be in 0 … 1, got {self.parking!r}")
         if not all(isinstance(number, (int, float)) for number in numbers):
             raise WorldError(f"length_m, lat_deg, lon_deg and edit_share are numbers, got {numbers}")
         if not 0.0 <= self.edit_share <= 1.0:
@@ -90,23 +103,36 @@ def street(seed: int, options: StreetOptions | None = None) -> World:
     site = streams["site"]
     heading_rad, slope = _heading_rad(options, float(site.uniform(22.0, 38.0))), float(site.uniform(0.012, 0.022))
     plan = drawn_plan(options.length_m / 2, streams["lots"], site)
-    base = built(plan, streams["furniture"], streams["greenery"])
-    objects = rebuild(base, plan, PAVEMENT_M, streams["edits"], streams["more"])
-    objects = partly_edited(objects, options.edit_share, streams["share"])
+    place = FAMILIES[options.family](FamilySite(plan, streams, np.random.default_rng([seed, _FAMILY_STREAM])))
     lat_rad, lon_rad = _anchor(options, heading_rad)
-    return World(
+    world = World(
         seed=seed,
         lat_rad=lat_rad,
         lon_rad=lon_rad + float(site.uniform(-2e-6, 2e-6)),
         height_m=HEIGHT_M,
         heading_rad=heading_rad,
         slope=slope,
-        crown=CROWN,
+        crown=place.crown,
         half_length_m=options.length_m / 2,
-        lane_offset_m=LANE_OFFSET_M,
-        kerb_m=KERB_M,
-        objects=objects,
+        lane_offset_m=place.lane_offset_m,
+        kerb_m=place.kerb_m,
+        objects=partly_edited(place.objects, options.edit_share, streams["share"]),
+        family=options.family,
+        bulge_m=place.bulge_m,
+        bulge_half_m=place.bulge_half_m,
+        kerb_parking=place.kerb_parking,
+        bays=place.bays,
+        parking=place.parking if options.parking is None else options.parking,
+        cruise_mps=place.cruise_mps,
     )
+    return world if place.profile is None else _on_hills(world, place.profile, plan.end_m)
+
+
+def _on_hills(world: World, profile: TerrainProfile, end_m: float) -> World:
+    """The world raised on a profile; its relief has the edges of the pieces in which `raised` lays the ground."""
+    x = np.linspace(-end_m, end_m, round(end_m) + 1)
+    knots = zip(x.tolist(), profile.height_m(x).tolist(), strict=True)
+    return replace(raised(world, profile), relief=tuple(knots))
 
 
 def _heading_rad(options: StreetOptions, drawn_deg: float) -> float:

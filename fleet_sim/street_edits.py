@@ -64,10 +64,11 @@ def partly_edited(objects: Sequence[WorldObject], share: float, rng: np.random.G
     """
     if share >= 1.0:
         return tuple(objects)
-    names = sorted({o.name for o in objects if o.edit != "kept"})
+    lasting = ("kept", "seasonal")
+    names = sorted({o.name for o in objects if o.edit not in lasting})
     made = {names[k] for k in rng.permutation(len(names))[: round(share * len(names))].tolist()}
-    there = (o for o in objects if o.edit == "kept" or o.name in made or "before" in o.states)
-    return tuple(o if o.edit == "kept" or o.name in made else replace(o, states=STATES, edit="kept") for o in there)
+    there = (o for o in objects if o.edit in lasting or o.name in made or "before" in o.states)
+    return tuple(o if o.edit in lasting or o.name in made else replace(o, states=STATES, edit="kept") for o in there)
 
 
 def _demolish(site: Site, lot: Lot, index: int, rng: np.random.Generator) -> None:

@@ -72,6 +72,9 @@ def _check(value: object, kind: object, where: str) -> None:
     elif kind is int:
         if isinstance(value, bool) or not isinstance(value, int):
             raise WorldError(f"{where} must be a whole number, got {_shown(value)}")
+    elif kind is bool:
+        if not isinstance(value, bool):
+            raise WorldError(f"{where} must be true or false, got {_shown(value)}")
     elif not isinstance(value, str):
         raise WorldError(f"{where} must be a text, got {_shown(value)}")
 

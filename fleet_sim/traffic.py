@@ -23,6 +23,8 @@ from gnd.fleet_sim.world import World
 FloatArray = NDArray[np.float64]
 
 MAX_PER_100_M: Final = 10.0
+_NO_WALKING_MPS: Final = 13.0
+"""Nobody walks along a road on which vehicles are as fast as this."""
 _BEYOND_M: Final = 55.0
 """Cars come and go so far beyond the ends of the stretch that is driven; the ground reaches 5 m farther."""
 _BEHIND_M: Final = 150.0
@@ -75,7 +77,8 @@ def movers_of(traffic: Traffic, stage: Stage) -> Movers | None:
         for direction in (stage.motion.direction, -stage.motion.direction):
             cars += _lane(traffic, stage, 1 if direction > 0 else -1, rng)
     busy = [*((car.track[:, 0], car.track[:, 1]) for car in cars), stage.ego_m()]
-    people = pedestrians(_count(traffic.pedestrians_per_100m, stage), traffic.crossing_share, stage, busy, rng)
+    walking = _count(traffic.pedestrians_per_100m, stage) if stage.world.cruise_mps < _NO_WALKING_MPS else 0
+    people = pedestrians(walking, traffic.crossing_share, stage, busy, rng)
     if not cars and not people:
         return None
     reach_m = stage.world.half_length_m + _BEYOND_M
@@ -165,8 +168,9 @@ def _car(world: World, direction: Direction, way_m: FloatArray, style: int, phas
     wave, length_m = 0.12, 60.0
     x = direction * way_m
     turn = tau * x / length_m + phase_rad
-    y = -direction * world.lane_offset_m + wave * np.sin(turn)
-    yaw = (0.0 if direction > 0 else pi) + np.arctan(wave * tau / length_m * np.cos(turn))
-    track = np.stack([x, y, world.road_height_m(y), yaw, np.zeros_like(x)], axis=1)
+    offset, widening = world.lane_m(x)
+    y = -direction * offset + wave * np.sin(turn)
+    yaw = (0.0 if direction > 0 else pi) + np.arctan(wave * tau / length_m * np.cos(turn) - direction * widening)
+    track = np.stack([x, y, world.road_height_m(y, x), yaw, np.zeros_like(x)], axis=1)
     shapes = parts.car(0.0, 0.0, 0.0, 0.0, style)
     return Mover(shapes, (0.0,) * len(shapes), track)

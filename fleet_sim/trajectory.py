@@ -107,24 +107,25 @@ class Motion:
         s = self.style
         x = self.start_m + self.direction * self.travelled_m(t_s)
         phase = tau * x / s.wander_length_m + s.wander_rad
-        lane = -self.direction * self.world.lane_offset_m
-        return x, lane + s.wander_m * np.sin(phase), s.wander_m * tau / s.wander_length_m * np.cos(phase)
+        offset, widening = self.world.lane_m(x)
+        y = -self.direction * offset + s.wander_m * np.sin(phase)
+        return x, y, s.wander_m * tau / s.wander_length_m * np.cos(phase) - self.direction * widening
 
     def T_map_vehicle(self, t_s: FloatArray) -> FloatArray:
         """Return the true poses, float64 (K, 4, 4), at times (K,) [s] after the start."""
         t_s = np.asarray(t_s, dtype=np.float64)
         x, y, slope = self.on_path(t_s)
-        side_rise = -self.world.crown * np.sign(y)
+        side_rise, grade = -self.world.crown * np.sign(y), self.world.grade(x)
         zero, one = np.zeros_like(x), np.ones_like(x)
-        forward = self.world.map_of_street(self.direction * np.stack([one, slope, slope * side_rise], axis=1))
-        along, across = np.stack([one, zero, zero], axis=1), np.stack([zero, one, side_rise], axis=1)
+        forward = self.world.map_of_street(self.direction * np.stack([one, slope, grade + slope * side_rise], axis=1))
+        along, across = np.stack([one, zero, grade], axis=1), np.stack([zero, one, side_rise], axis=1)
         up = _unit(np.cross(self.world.map_of_street(along), self.world.map_of_street(across)))
         ahead = _unit(forward)
         T = np.tile(np.eye(4), (len(x), 1, 1))
         roll, pitch, heave = swaying(t_s, self.style.sway_rad)
         R_map_road = np.stack([ahead, np.cross(up, ahead), up], axis=2)
         T[:, :3, :3] = R_map_road @ exp_so3(np.stack([roll, pitch, zero], axis=1))
-        ground = self.world.map_of_street(np.stack([x, y, self.world.road_height_m(y)], axis=1))
+        ground = self.world.map_of_street(np.stack([x, y, self.world.road_height_m(y, x)], axis=1))
         T[:, :3, 3] = ground + heave[:, None] * up
         return T
 

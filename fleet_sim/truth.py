@@ -10,6 +10,10 @@ has revealed is new to the map.
 
 Modified. A voxel with both Gaussians is modified when a quarter of its sub-cells lie on surfaces that went or came,
 farther than one sub-cell (10 to 20 cm) from every surface of the other state.
+
+Seasons. Leaves and snow ("seasonal" things of a world) that come or go change no map: leaves that are gone count as
+standing still, those that came as nothing. What they hid and reveal follows the rule above. `seasonal` tells which
+voxels they touch: whoever calls one of those changed has followed the season, and that is counted apart.
 """
 
 import hashlib
@@ -35,12 +39,16 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame, zones
 from gnd.gnd_map.tile_id import TileId
 
-Level = Literal["all", "marginal_excluded", "scored"]
+Level = Literal["observable", "all", "scored"]
+"""*observable*: near enough, and visible after the changes, marginal ones too; it leads. *all*: every voxel that a ray
+touched. *scored*: observable ones whose class no hair decides."""
 LEVELS: Final[tuple[Level, ...]] = get_args(Level)
+CHANGES: Final = (ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
+"""The three classes of change."""
 BoolArray = NDArray[np.bool_]
 
 _FORMAT: Final = "gnd.truth"
-_VERSION: Final = 1
+_VERSION: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +62,11 @@ class TruthRules:
         marginal_cells: between these counts of sub-cells, existence is decided by a hair.
         shell_cells: so many sub-cells of surface touching an unoccupied voxel from outside let noise decide.
         revealed_share: so much of a kept surface seen only after makes "normal" doubtful.
-        reach_m: scored voxels lie within this distance of the road's middle (plus a lane).
+        reach_m: observable voxels lie within this distance of the road's middle (plus a lane).
         end_m: and at least so far inside the street's ends.
         low_m, high_m: and between these heights over the road.
-        seen_cells: sub-cells of a scored Gaussian that are visible after.
-        passes: followed rays that pass after through a scored voxel without a Gaussian.
+        seen_cells: sub-cells of an observable Gaussian that are visible after.
+        passes: followed rays that pass after through an observable voxel without a Gaussian.
     """
 
     n_min_cells: int = N_MIN_CELLS
@@ -88,6 +96,7 @@ class Truth:
         change_class: uint8 (V,), a `ChangeClass` from NORMAL to EMPTY.
         clear: bool (V,), not marginal.
         observable: bool (V,), near enough and visible.
+        seasonal: bool (V,), leaves or snow that come or go were met there in either state.
         before: Gaussians of the state before.
         after: Gaussians of what stands after.
     """
@@ -100,11 +109,14 @@ class Truth:
     change_class: NDArray[np.uint8]
     clear: BoolArray
     observable: BoolArray
+    seasonal: BoolArray
     before: Mapping[TileId, Gaussians] = field(repr=False)
     after: Mapping[TileId, Gaussians] = field(repr=False)
 
     def __post_init__(self) -> None:
-        sizes = {len(a) for a in (self.morton, self.voxel_id, self.change_class, self.clear, self.observable)}
+        sizes = {
+            len(a) for a in (self.morton, self.voxel_id, self.change_class, self.clear, self.observable, self.seasonal)
+        }
         if len(sizes) != 1:
             raise TruthError(f"truth columns have different lengths: {sorted(sizes)}")
         if len(self.change_class) and self.change_class.max() > ChangeClass.EMPTY:
@@ -121,8 +133,9 @@ class Truth:
         """
         if level not in LEVELS:
             raise TruthError(f"unknown level {level!r}, use one of {', '.join(LEVELS)}")
-        masks = {"all": np.ones(len(self), np.bool_), "marginal_excluded": self.clear}
-        return masks.get(level, self.clear & self.observable)
+        if level == "all":
+            return np.ones(len(self), np.bool_)
+        return self.observable if level == "observable" else self.clear & self.observable
 
     def counts(self, level: Level) -> dict[str, int]:
         """Return the number of voxels of each class at a level, by lower-case class name."""
@@ -162,6 +175,7 @@ def _truth_of_zone(world: World, scan: DenseScan, rules: TruthRules, plan: ScanP
         change_class=classes[order],
         clear=clear[order],
         observable=observable[order],
+        seasonal=scan.count(dense_scan.SEASONAL)[order] > 0,
         before=scan.before.finish(rules.n_min_cells),
         after=scan.after.finish(rules.n_min_cells),
     )
@@ -204,13 +218,22 @@ def marginal(scan: DenseScan, rules: TruthRules) -> BoolArray:
 
 def observed(world: World, scan: DenseScan, classes: NDArray[np.uint8], rules: TruthRules) -> BoolArray:
     """Return which voxels, bool (V,), are near enough to the lanes and were visible after the changes."""
-    centre = world.street_of_map(scan.grid_frame.centre_map_m(scan.g))
-    near = np.abs(centre[:, 1]) <= rules.reach_m + world.lane_offset_m
-    near &= np.abs(centre[:, 0]) <= world.half_length_m - rules.end_m
-    near &= (centre[:, 2] >= rules.low_m) & (centre[:, 2] <= rules.high_m)
+    close = near(world, world.street_of_map(scan.grid_frame.centre_map_m(scan.g)), rules)
     seen = scan.count(dense_scan.AFTER_KEPT | dense_scan.AFTER_COME) >= rules.seen_cells
     gone = (classes == ChangeClass.DELETED) | (classes == ChangeClass.EMPTY)
-    return np.asarray(near & np.where(gone, scan.passes[:, 1] >= rules.passes, seen))
+    free = scan.passes[:, 1] >= rules.passes
+    fallen = (
+        scan.count(dense_scan.LEAF_BEFORE) > 0
+    ) & free  # leaves that count as standing, but can be seen to be gone
+    return np.asarray(close & np.where(gone, free, seen | fallen))
+
+
+def near(world: World, centre_street: NDArray[np.float64], rules: TruthRules) -> BoolArray:
+    """Return which points (N, 3) of the street frame are near enough to the lanes, bool (N,)."""
+    found = np.abs(centre_street[:, 1]) <= rules.reach_m + world.lane_offset_m
+    found &= np.abs(centre_street[:, 0]) <= world.half_length_m - rules.end_m
+    above = centre_street[:, 2] - world.relief_m(centre_street[:, 0])
+    return np.asarray(found & (above >= rules.low_m) & (above <= rules.high_m))
 
 
 def _changed_share(scan: DenseScan) -> NDArray[np.float64]:
@@ -281,7 +304,7 @@ def load_or_make_truth(world: World, path: Path, plan: ScanPlan | None = None) -
     return truth
 
 
-_COLUMNS: Final = ("morton", "voxel_id", "change_class", "clear", "observable")
+_COLUMNS: Final = ("morton", "voxel_id", "change_class", "clear", "observable", "seasonal")
 _GAUSSIAN_COLUMNS: Final = ("voxel_id", "count", "cells", "mean_m", "cov_m2")
 
 

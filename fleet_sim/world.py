@@ -23,7 +23,8 @@ from gnd.fleet_sim.strict_json import arguments, items, mapping, parsed
 from gnd.gnd_map.geodesy import LocalFrame
 
 State = Literal["before", "after"]
-Edit = Literal["kept", "added", "removed", "moved", "reshaped"]
+Edit = Literal["kept", "added", "removed", "moved", "reshaped", "seasonal"]
+"""What happened to a thing between the states; "seasonal": leaves and snow, which come and go and change no map."""
 STATES: Final = get_args(State)
 EDITS: Final = get_args(Edit)
 
@@ -33,6 +34,8 @@ MAX_HALF_LENGTH_M: Final = 1000.0
 SURROUNDINGS_M: Final = 500.0
 """Everything lies so near to the stretch that is driven."""
 _MAX_FILE_BYTES: Final = 64 * 1024 * 1024
+_LISTS: Final = ("relief", "bays", "kerb_parking")
+_NO_NUMBERS: Final = ("objects", "seed", "family", *_LISTS)
 _TYPES: Final[dict[str, type[Block] | type[Post] | type[Ball]]] = {"block": Block, "post": Post, "ball": Ball}
 
 
@@ -68,6 +71,22 @@ class WorldObject:
             raise WorldError(f"object {self.name!r} is {self.edit}, but stands in the states {self.states}")
 
 
+@dataclass(frozen=True, slots=True)
+class Bay:
+    """A place away from the kerbs where a car may stand during a drive.
+
+    Attributes:
+        x_m, y_m: its middle, street frame.
+        yaw_rad: direction in which the car stands, counter-clockwise from the street's x.
+        van: whether it is a place for delivery: a van with a high body.
+    """
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    van: bool = False
+
+
 @dataclass(frozen=True)
 class World:
     """A street with everything on it, in both states.
@@ -82,6 +101,14 @@ class World:
         lane_offset_m: middle of a lane from the middle of the road (traffic keeps to the right).
         kerb_m: distance of the kerbs from the middle of the road.
         objects: everything, in a fixed order.
+        family: what kind of place it is, see `gnd.fleet_sim.families`.
+        relief: (x, height) of the ground over the reference plane, rising in x, straight in between; () is level.
+        bulge_m: lanes swing out to their right by so much around x = 0 (a roundabout), 0 for straight lanes.
+        bulge_half_m: and reach their old place again at this distance along the street.
+        kerb_parking: whether cars park along the kerbs.
+        bays: where cars stand beside that.
+        parking: share of the slots and bays that are taken on a drive where the drive says nothing else.
+        cruise_mps: speed of a drive where the drive says nothing else.
     """
 
     seed: int
@@ -95,9 +122,17 @@ class World:
     lane_offset_m: float
     kerb_m: float
     objects: tuple[WorldObject, ...]
+    family: str = "street"
+    relief: tuple[tuple[float, float], ...] = ()
+    bulge_m: float = 0.0
+    bulge_half_m: float = 25.0
+    kerb_parking: bool = True
+    bays: tuple[Bay, ...] = ()
+    parking: float = 0.2
+    cruise_mps: float = 9.0
 
     def __post_init__(self) -> None:
-        numbers = {name: value for name, value in vars(self).items() if name not in ("objects", "seed")}
+        numbers = {name: value for name, value in vars(self).items() if name not in _NO_NUMBERS}
         bad = [name for name, value in numbers.items() if not isinstance(value, (int, float)) or not isfinite(value)]
         if bad:
             raise WorldError(f"world {self.seed}: {', '.join(bad)} must be finite numbers")
@@ -111,7 +146,23 @@ class World:
         for name, limit in limits.items():
             if abs(numbers[name]) > limit:
                 raise WorldError(f"world {self.seed}: {name} must be in -{limit:g} … {limit:g}, got {numbers[name]}")
+        self._check_way()
         self._check_objects()
+
+    def _check_way(self) -> None:
+        """Refuse ground that is no function of x, lanes that turn too sharply, and impossible defaults of drives."""
+        x, heights = [at for at, _ in self.relief], [height for _, height in self.relief]
+        if x != sorted(set(x)) or any(not isfinite(value) or abs(value) > 1e3 for value in (*x, *heights)):
+            raise WorldError(f"world {self.seed}: relief needs finite heights at rising x, got {self.relief[:3]} ...")
+        if not 0.0 <= self.bulge_m <= self.bulge_half_m or self.bulge_half_m <= 0.0:
+            raise WorldError(
+                f"world {self.seed}: need 0 <= bulge_m <= bulge_half_m, got {self.bulge_m} and {self.bulge_half_m}"
+            )
+        if not 0.0 <= self.parking <= 1.0 or not 1.0 <= self.cruise_mps <= 50.0:
+            raise WorldError(
+                f"world {self.seed}: parking must be in 0 … 1 and cruise_mps in 1 … 50,"
+                f" got {self.parking} and {self.cruise_mps}"
+            )
 
     def _check_objects(self) -> None:
         for state in STATES:
@@ -160,9 +211,37 @@ class World:
         """Return map-frame coordinates (..., 3) of street-frame points (..., 3) [m]."""
         return points_street @ np.linalg.inv(self.A_street_map).T
 
-    def road_height_m(self, y_street_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the street-frame height of the carriageway at distances y (N,) from its middle [m]."""
-        return -self.crown * np.abs(y_street_m)
+    def road_height_m(
+        self, y_street_m: NDArray[np.float64], x_street_m: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the street-frame height of the carriageway at distances y (N,) from its middle [m].
+
+        Where the ground has a relief, x (N,) along the street decides, too.
+        """
+        height = -self.crown * np.abs(y_street_m)
+        return height if x_street_m is None or not self.relief else height + self.relief_m(x_street_m)
+
+    def relief_m(self, x_street_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height of the ground over the reference plane at x (N,) [m]; 0 everywhere on level ground."""
+        if not self.relief:
+            return np.zeros_like(x_street_m)
+        return np.asarray(np.interp(x_street_m, *np.array(self.relief).T))
+
+    def grade(self, x_street_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rise a metre at x (N,) as a vehicle feels it: straight between the middles of the pieces."""
+        if len(self.relief) < 2:
+            return np.zeros_like(x_street_m)
+        x, height = np.array(self.relief).T
+        return np.asarray(np.interp(x_street_m, 0.5 * (x[1:] + x[:-1]), np.diff(height) / np.diff(x)))
+
+    def lane_m(self, x_street_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how far a lane's middle is from the road's at x (N,) [m], and by how much that grows a metre."""
+        offset, slope = np.full_like(x_street_m, self.lane_offset_m), np.zeros_like(x_street_m)
+        if not self.bulge_m:
+            return offset, slope
+        turn = np.clip(pi * x_street_m / self.bulge_half_m, -pi, pi)
+        offset = offset + 0.5 * self.bulge_m * (1.0 + np.cos(turn))
+        return offset, -0.5 * self.bulge_m * pi / self.bulge_half_m * np.sin(turn)
 
     def in_state(self, state: State) -> tuple[WorldObject, ...]:
         """Return the objects that stand in `state`.
@@ -182,6 +261,9 @@ class World:
 def to_json(world: World) -> str:
     """Return the text of the world's file: floats as Python writes them, so that reading gives the same bits."""
     head = {key: value for key, value in vars(world).items() if key in World.__dataclass_fields__ and key != "objects"}
+    head = {key: value for key, value in head.items() if value != World.__dataclass_fields__[key].default}
+    if world.bays:
+        head["bays"] = [asdict(bay) for bay in world.bays]
     objects = ",\n".join(json.dumps(_encode_object(o)) for o in world.objects)
     start = json.dumps({"format": _FORMAT, "version": _VERSION, **head})[:-1]
     return f'{start}, "objects": [\n{objects}\n]}}\n'
@@ -201,11 +283,36 @@ def from_json(text: str, where: str = "world") -> World:
         raise WorldError(f"{where} has version {version!r}, this program reads version {_VERSION}")
     listed = items(data.pop("objects", None), f"{where}, objects")
     objects = tuple(_decode_object(o, f"{where}, object {index}") for index, o in enumerate(listed))
-    head = arguments(World, data, where, besides=["objects"])
+    more = _decode_place(data, where)
+    head = arguments(World, data, where, besides=["objects", *_LISTS])
     try:
-        return World(**head, objects=objects)
+        return World(**head, **more, objects=objects)
     except WorldError as error:
         raise WorldError(f"{where} cannot be read: {error}") from error
+
+
+def _decode_place(data: dict[str, Any], where: str) -> dict[str, Any]:
+    """Take the lists of a world's head out of its file: ground, bays, and whether cars park at the kerbs."""
+    found: dict[str, Any] = {}
+    if "relief" in data:
+        knots = items(data.pop("relief"), f"{where}, relief")
+        if not all(isinstance(knot, list) and len(knot) == 2 and all(map(_is_number, knot)) for knot in knots):
+            raise WorldError(f"{where}, relief must be pairs of numbers")
+        found["relief"] = tuple((float(x), float(height)) for x, height in knots)
+    if "bays" in data:
+        found["bays"] = tuple(
+            Bay(**arguments(Bay, mapping(bay, f"{where}, bay {index}"), f"{where}, bay {index}"))
+            for index, bay in enumerate(items(data.pop("bays"), f"{where}, bays"))
+        )
+    if "kerb_parking" in data:
+        found["kerb_parking"] = data.pop("kerb_parking")
+        if not isinstance(found["kerb_parking"], bool):
+            raise WorldError(f"{where}, kerb_parking must be true or false")
+    return found
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _encode_object(o: WorldObject) -> dict[str, Any]:

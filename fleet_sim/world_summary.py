@@ -24,10 +24,12 @@ def summary(world: World) -> dict[str, object]:
     count = Counter(edit for edit, _, _ in edited)
     return {
         "seed": world.seed,
+        "family": world.family,
         "anchor": {"lat_deg": degrees(world.lat_rad), "lon_deg": degrees(world.lon_rad), "height_m": world.height_m},
         "districts": districts(world),
         "heading_deg": round(degrees(world.heading_rad), 3),
         "slope": round(world.slope, 5),
+        "parking": {"share": world.parking, "kerb": world.kerb_parking, "bays": len(world.bays)},
         "length_m": 2 * world.half_length_m,
         "shapes": {state: len(world.shapes(state)) for state in STATES},
         "kinds": dict(sorted(kinds.items())),

@@ -116,7 +116,8 @@ class PoleDrive:
         traffic = Traffic.urban() if drive.traffic else Traffic()
         self._config = DriveConfig("car", drive.sensor, seed=drive.seed, errors=PERFECT, traffic=traffic)
         self._drive, self._simulation = drive, DriveSimulation(world, self._config)
-        shapes = (*world.shapes("after"), *parked_cars(world, "after", self._config.car_share, drive.seed))
+        share = world.parking if self._config.car_share is None else self._config.car_share
+        shapes = (*world.shapes("after"), *parked_cars(world, "after", share, drive.seed))
         self._scene, self._lidar = Scene.build(shapes, world.A_street_map), Lidar(self._config.model)
         self.posts = posts_of(world, len(shapes))
 

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from gnd.fleet_sim.insert import Inserter
 from gnd.fleet_sim.shapes import Block, Post, Shape
 from gnd.gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
+from gnd.gnd_map.classes import ChangeClass
 from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
-from studies.real.drive import FoundVoxels, Poses, Tiles, detect, local_map_of, refined_scans, segmented
+from studies.real.drive import DriveFindings, FoundVoxels, Poses, Tiles, detect, local_map_of, refined_scans, segmented
 from studies.real.scene import Cells, RecordedScans, RecordedScene, in_range, place
 
 F64 = NDArray[np.float64]
@@ -255,12 +256,16 @@ class Untouched:
 
     found: FoundVoxels
     tiles: Tiles
+    mapping: FoundVoxels
+    """What the map's half itself would say of these voxels."""
     seen: I64
-    """Keys of the voxels that a ray of the map's half crossed or ended in: of the others the map cannot know."""
+    """Keys of the voxels that the map's half had looked at, see `looked_at`: of the others the map cannot know."""
     mapped: Cells
     driven: Cells
     moving: Cells
     """Points of the driven half that were marked as moving."""
+    driven_from_m: F64
+    """(S, 3) where the LiDAR was in the driven scans."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -269,6 +274,7 @@ class Inserted:
 
     found: FoundVoxels
     tiles: Tiles
+    seen: I64
     truth: RoundTruth
     new: tuple[Placed, ...]
     gone: tuple[Placed, ...]
@@ -318,10 +324,32 @@ def _untouched(scene: RecordedScene, mapping: list[Scan], driving: list[Scan], m
     local_map = local_map_of(scene, tiles)
     notes = _Notes(scene)
     scans = segmented(refined_scans(scene, local_map, driving, method.poses), method.segment)
-    found = detect(scene, local_map, notes.noted(scans), method.detect)
-    seen = detect(scene, local_map, segmented(map(scene.refined, mapping), method.segment), method.detect).keys
+    drive = detect(scene, local_map, notes.noted(scans), method.detect)
+    again = _again(scene, drive, mapping, method)
     driven, moving = Cells.of(notes.driven), Cells.of(notes.moving)
-    return Untouched(found, tiles, seen, Cells.of(points), driven, moving)
+    from_m = np.array([scene.poses.at(scan.t_ns)[:3] @ scene.T_vehicle_lidar[:, 3] for scan in driving])
+    return Untouched(drive.found, tiles, again, looked_at(again), Cells.of(points), driven, moving, from_m)
+
+
+def _again(scene: RecordedScene, drive: DriveFindings, mapping: Iterable[Scan], method: Method) -> FoundVoxels:
+    """What the mapping scans say of the map with what the drive found new in it."""
+    scans = segmented(map(scene.refined, mapping), method.segment)
+    return detect(scene, local_map_of(scene, drive.grown), scans, method.detect).found
+
+
+def looked_at(mapping: FoundVoxels) -> I64:
+    """Keys of the voxels that the map's half had looked at, by its rays alone.
+
+    One that holds a Gaussian, of the map or found new by the drive: as many rays of the map's half ended in it or
+    passed through this very surface as a Gaussian needs sub-cells; with fewer the map cannot hold it. Rays that only
+    crossed another part of the voxel do not tell whether there was something: over a road, most pass above the ground.
+    One that holds none: the map's half, too, calls it empty.
+
+    Args:
+        mapping: what the mapping scans say of the map with the drive's new voxels in it.
+    """
+    met = mapping.in_map & (mapping.hits + mapping.passes >= N_MIN_CELLS)
+    return np.sort(mapping.keys[met | mapping.where(ChangeClass.EMPTY)])
 
 
 class _Notes:
@@ -355,9 +383,11 @@ def _inserted(
     tiles = points.finish()
     local_map = local_map_of(scene, tiles)
     scans = refined_scans(scene, local_map, into_drive.paint(driving), method.poses)
-    found = detect(scene, local_map, segmented(scans, method.segment), method.detect)
+    drive = detect(scene, local_map, segmented(scans, method.segment), method.detect)
+    again = _again(scene, drive, Painter(scene, [one.shape for one in gone], 2 * number).paint(mapping), method)
     for _ in crossed.paint(driving):
         pass
     static = Cells.of(scene.accumulated(map(scene.refined, [*mapping, *driving])))
     shadowed = changed_by_shadow(untouched.mapped, Cells.of(points))
-    return Inserted(found, tiles, truth_of(static, into_drive, into_map, crossed, shadowed), new, gone)
+    truth = truth_of(static, into_drive, into_map, crossed, shadowed)
+    return Inserted(drive.found, tiles, looked_at(again), truth, new, gone)

@@ -161,6 +161,13 @@ def keys_of(grid_frame: GridFrame, g: ArrayLike) -> I64:
     return np.asarray((offset[..., 0] << 2 * _BITS) | (offset[..., 1] << _BITS) | offset[..., 2])
 
 
+def centres_m(grid_frame: GridFrame, keys: I64) -> F64:
+    """(N, 3) map frame, the middles of voxels that are named by their keys (N,)."""
+    mask = (1 << _BITS) - 1
+    offset = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1)
+    return np.asarray(grid_frame.centre_map_m(offset - _HALF + origin_of(grid_frame)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
     """Voxels with points: keys (M,) int64 increasing, occupied sub-cells (M,) and points (M,)."""

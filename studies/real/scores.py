@@ -8,19 +8,22 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.classes import CHANGED, ChangeClass
+from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.gaussian import full_matrices
 from gnd.vehicle_agent.detect.records import planar_normals
 from gnd.vehicle_agent.local_map import LocalMap
 from studies.frame.tables import Sheet, fixed, sheet
+from studies.real.bands import CHANGE_NAMES, DISTANCES_M, bands_of, bands_sheet, distance_m, inserted_sheet, inside
 from studies.real.drive import FoundVoxels, local_map_of
 from studies.real.rounds import Round
+from studies.real.scene import centres_m
 
 CAUSES: Final[dict[str, str]] = {
     "mover": "a third of its points lies on what motion segmentation calls moving",
     "edge of a surface": "the map just missed it: 5 to 19 sub-cells, on the plane of a planar neighbour",
     "map just missed it": "5 to 19 sub-cells in the map's half, on no neighbour's plane",
     "map did not see it": "fewer than 5 sub-cells in the map's half",
+    "permeable": "leaves, fences: most rays of the map's half passed the map's Gaussian, too",
     "far": "more than 25 m from the track",
     "thin in the map": "20 to 30 sub-cells in the map's half",
     "rough": "no plane: leaves, posts, corners",
@@ -95,6 +98,7 @@ def cause_of(one: Round, rows: NDArray[np.int64]) -> list[str]:
         weak & surfaces.extended_to(u.found.g[rows], mean),
         weak,
         ~in_map,
+        _permeable(u.mapping, keys),
         distance > FAR_M,
         in_map & (mapped < THIN_CELLS),
         surfaces.rough_at(u.found.g[rows]),
@@ -104,8 +108,13 @@ def cause_of(one: Round, rows: NDArray[np.int64]) -> list[str]:
     return [names[int(i)] for i in first]
 
 
+def _permeable(mapping: FoundVoxels, keys: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(K,) whether more rays of the map's half passed through its own Gaussian than ended there."""
+    row = mapping.rows(keys)
+    return (row >= 0) & mapping.in_map[row] & (mapping.passes[row] > mapping.hits[row])
+
+
 I64 = NDArray[np.int64]
-CHANGE_NAMES: Final = {c: c.name.lower() for c in CHANGED}
 NEAR_M: Final = 3.0
 """Precision is also told for voxels within this distance of an inserted object."""
 
@@ -114,7 +123,8 @@ def summary_of(rounds: Sequence[Round]) -> dict[str, Any]:
     """Everything as plain numbers, pooled over the rounds."""
     return {
         "untouched": untouched_scores([r.untouched.found for r in rounds]) | {"causes": _causes(rounds)},
-        "untouched_seen": untouched_scores([r.untouched.found.within(r.untouched.seen) for r in rounds]),
+        "untouched_seen": untouched_scores([r.untouched.found.within(r.untouched.seen) for r in rounds])
+        | {"by": bands_of(rounds)},
         "inserted": inserted_scores(rounds),
         "scans_driven": sum(r.untouched.found.scans_used for r in rounds),
         "map_gaussians": sum(len(g) for r in rounds for g in r.untouched.tiles.values()),
@@ -150,24 +160,70 @@ def inserted_scores(rounds: Sequence[Round]) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """One class of one round, voxel by voxel: those that are true, and those that are claimed and count.
+
+    wanted: keys (T,) that are true. hit: (T,) whether each is claimed. false, of claimed voxels that are not true,
+    (F,) each: `wrong_m` where they lie, `near` an object, `seen` by the map's half.
+    """
+
+    wanted: I64
+    hit: NDArray[np.bool_]
+    wanted_m: NDArray[np.float64]
+    wrong_m: NDArray[np.float64]
+    near: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
+
+
+def _judged(one: Round, change: ChangeClass) -> _Judged:
+    found, truth = one.inserted.found, one.inserted.truth
+    wanted = truth.new if change is ChangeClass.NEW else truth.measured
+    right = truth.new if change is ChangeClass.NEW else truth.deleted
+    claimed = found.where(change) & ~np.isin(found.keys, truth.ignored)
+    wrong = found.take(np.asarray(claimed & ~np.isin(found.keys, right)))
+    return _Judged(
+        wanted=wanted,
+        hit=np.isin(wanted, found.keys[claimed]),
+        wanted_m=centres_m(one.scene.grid_frame, wanted),
+        wrong_m=wrong.mean_m,
+        near=_near_objects(one, wrong.mean_m),
+        seen=np.isin(wrong.keys, one.inserted.seen),
+    )
+
+
 def _class_scores(rounds: Sequence[Round], change: ChangeClass) -> dict[str, Any]:
-    true = hit = reported = near = 0
-    for r in rounds:
-        found, truth = r.inserted.found, r.inserted.truth
-        wanted = truth.new if change is ChangeClass.NEW else truth.measured
-        wider = truth.new if change is ChangeClass.NEW else truth.deleted
-        claimed = found.where(change) & ~np.isin(found.keys, truth.ignored)
-        right = np.isin(found.keys[claimed], wider)
-        true, hit = true + len(wanted), hit + int(np.isin(wanted, found.keys[claimed]).sum())
-        reported += int(claimed.sum()) - int((right & ~np.isin(found.keys[claimed], wanted)).sum())
-        near += int((~right & _near_objects(r, found.mean_m[claimed])).sum())
+    judged = [_judged(r, change) for r in rounds]
+    true, hit = sum(len(j.wanted) for j in judged), sum(int(j.hit.sum()) for j in judged)
+    false = sum(len(j.seen) for j in judged)
+    near, seen = sum(int(j.near.sum()) for j in judged), sum(int(j.seen.sum()) for j in judged)
     return {
         "true": true,
         "found": hit,
         "recall": _rate(hit, true, 1.0),
-        "precision": _rate(hit, reported if true else 0, 1.0),
+        "precision": _rate(hit, hit + false if true else 0, 1.0),
         "precision_near_objects": _rate(hit, hit + near if true else 0, 1.0),
-        "false": reported - hit,
+        "precision_seen": _rate(hit, hit + seen if true else 0, 1.0),
+        "false": false,
+        "false_seen": seen,
+        "by_distance": {name: _in_band(rounds, judged, span) for name, span in DISTANCES_M.items()},
+    }
+
+
+def _in_band(rounds: Sequence[Round], judged: Sequence[_Judged], span: tuple[float, float]) -> dict[str, Any]:
+    """Recall and precision in one band of distance; false ones only where both halves had looked."""
+    true = hit = false = 0
+    for r, j in zip(rounds, judged, strict=True):
+        from_m = r.untouched.driven_from_m
+        here = inside(distance_m(from_m, j.wanted_m), span)
+        true, hit = true + int(here.sum()), hit + int((here & j.hit).sum())
+        false += int((inside(distance_m(from_m, j.wrong_m), span) & j.seen).sum())
+    return {
+        "true": true,
+        "found": hit,
+        "recall": _rate(hit, true, 1.0),
+        "false": false,
+        "precision": _rate(hit, hit + false, 1.0),
     }
 
 
@@ -201,23 +257,28 @@ def sheets_of(found: dict[str, Any]) -> list[Sheet]:
         f" {found['options']['rounds']} rounds, {found['runtime_s']} s",
         notes=list(found["left_out"]),
     )
-    false, seen = _false_changes(found["untouched"]), found["untouched_seen"]
-    false.notes.append(
-        f"Where the map's half had looked: {sum(seen['false'].values()):,} of {seen['observed']:,} observed,"
-        f" {fixed(seen['false_per_1000'])} of 1,000"
-    )
-    return [head, false, _causes_sheet(found["untouched"]["causes"]), _inserted(found["inserted"])]
+    untouched, inserted = found["untouched"], found["inserted"]
+    tables = [head, _false_changes(untouched, found["untouched_seen"]), _causes_sheet(untouched["causes"])]
+    tables.append(bands_sheet(found["untouched_seen"]["by"]))
+    return [*tables, _inserted(inserted), inserted_sheet(inserted)]
 
 
-def _false_changes(untouched: dict[str, Any]) -> Sheet:
-    table = sheet("Nothing changed: reported nevertheless", "", "voxels", "a 1,000 observed", "a 1,000 Gaussians")
+def _false_changes(untouched: dict[str, Any], seen: dict[str, Any]) -> Sheet:
+    columns = ("voxels", "a 1,000 observed", "a 1,000 Gaussians", "observed in both", "a 1,000 in both")
+    table = sheet("Nothing changed: reported nevertheless", "", *columns)
     gaussians = max(untouched["observed_gaussian"], 1)
     for name, n in untouched["false"].items():
-        table.add(name, f"{n:,}", fixed(untouched["false_per_1000_by_class"][name]), f"{1000 * n / gaussians:.2f}")
-    total = sum(untouched["false"].values())
+        rates = fixed(untouched["false_per_1000_by_class"][name]), f"{1000 * n / gaussians:.2f}"
+        table.add(name, f"{n:,}", *rates, f"{seen['false'][name]:,}", fixed(seen["false_per_1000_by_class"][name]))
+    total, both = sum(untouched["false"].values()), sum(seen["false"].values())
     rates = fixed(untouched["false_per_1000"]), fixed(untouched["false_per_1000_gaussian"])
-    table.add("all", f"{total:,}", *rates, style="bold")
-    table.add("observed", f"{untouched['observed']:,}", f"{untouched['observed_gaussian']:,} Gaussians", "")
+    table.add("all", f"{total:,}", *rates, f"{both:,}", fixed(seen["false_per_1000"]), style="bold")
+    table.add("observed", f"{untouched['observed']:,}", f"{untouched['observed_gaussian']:,} Gaussians", "",
+              f"{seen['observed']:,}", f"{seen['observed_gaussian']:,} Gaussians")  # fmt: skip
+    table.notes.append(
+        f"Observed in both: {fixed(seen['false_per_1000_gaussian'])} of 1,000 Gaussians. The map's half never looked at"
+        f" {total - both:,} of the {total:,} voxels: the map cannot know of them"
+    )
     return table
 
 
@@ -231,11 +292,11 @@ def _causes_sheet(causes: dict[str, dict[str, int]]) -> Sheet:
 
 
 def _inserted(inserted: dict[str, Any]) -> Sheet:
-    table = sheet("Objects inserted", "", "objects", "voxels", "recall", "precision", "precision within 3 m of objects")
+    places = ("precision", "observed in both", "within 3 m of objects")
+    table = sheet("Objects inserted", "", "objects", "voxels", "recall", *places)
     for name in ("new", "deleted"):
         one = inserted[name]
-        shares = (
-            "–" if one[key] is None else f"{one[key]:.1%}" for key in ("recall", "precision", "precision_near_objects")
-        )
+        keys = ("recall", "precision", "precision_seen", "precision_near_objects")
+        shares = ("–" if one[key] is None else f"{one[key]:.1%}" for key in keys)
         table.add(name, str(inserted["objects"][name]), str(one["true"]), *shares)
     return table

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from studies.real.scene import load
 from studies.real.scores import sheets_of, summary_of
 
 Progress = Callable[[str, int, int], None]
+Split = Literal["alternate", "halves"]
+SPLITS: Final[dict[Split, tuple[str, str]]] = {"alternate": ("even", "odd"), "halves": ("first-half", "second-half")}
+"""The scans that make the map, and those that are driven."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +38,11 @@ class RealOptions:
     scans: Path = option(MISSING, "Folder of KITTI .bin, PCD or RADIATE scans, or MCAP file.")
     kind: str = option(AUTO, "kitti, pcd, mcap, radiate or auto.", "--format")
     topic: str | None = option(None, "Topic of the clouds, for an MCAP file with several.")
-    map_scans: str = option("even", "Scans that make the map.")
-    drive_scans: str = option("odd", "Scans that are driven.")
+    split: Split = option(
+        "alternate", "Every other scan makes the map, or the first half of the drive does; the others are driven."
+    )
+    map_scans: str | None = option(None, "Scans that make the map, in place of the split's.")
+    drive_scans: str | None = option(None, "Scans that are driven, in place of the split's.")
     rounds: int = option(4, "Ways to lay the recording on the grid, with new objects.", span=(1, None))
     objects: int = option(8, "Objects a round, half of them into either half.", span=(0, None))
     seed: int = option(0, "Of the ways on the grid and the places of objects.")
@@ -63,12 +69,12 @@ class RealOptions:
             RealDataError: a scan is in both.
             ImportDriveError: a rule that is none, or that leaves too few scans.
         """
-        mapping, driving = chosen_scans(self.map_scans, n), chosen_scans(self.drive_scans, n)
+        maps, drives = SPLITS[self.split]
+        maps, drives = self.map_scans or maps, self.drive_scans or drives
+        mapping, driving = chosen_scans(maps, n), chosen_scans(drives, n)
         both = np.intersect1d(mapping, driving)
         if len(both):
-            raise RealDataError(
-                f"--map-scans {self.map_scans} and --drive-scans {self.drive_scans} share {len(both)} of {n} scans"
-            )
+            raise RealDataError(f"--map-scans {maps} and --drive-scans {drives} share {len(both)} of {n} scans")
         return mapping, driving
 
 

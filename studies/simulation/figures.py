@@ -18,8 +18,8 @@ from studies.simulation.cloud import arrived, map_of_one, merged_map
 from studies.simulation.scores import SimulationOutcome, WorldOutcome, target_single
 from studies.simulation.worlds import read_world_base
 
-_LEVEL_NAMES: Final = {"all": "all voxels", "marginal_excluded": "marginal excluded", "scored": "scored voxels"}
-_LEVEL_STYLE: Final = {"scored": "-", "marginal_excluded": "--", "all": ":"}
+_LEVEL_NAMES: Final = {"observable": "observable voxels", "all": "all voxels", "scored": "scored voxels"}
+_LEVEL_STYLE: Final = {"observable": "-", "scored": "--", "all": ":"}
 
 
 def draw_figures(outcome: SimulationOutcome, summary: Mapping[str, Any], folder: Path) -> list[Path]:
@@ -44,7 +44,7 @@ def draw_changes(outcome: SimulationOutcome, world: WorldOutcome, truth: Truth, 
     held = arrived(base, world.vehicles[:n], merge, outcome.options.upload)
     merged = merged_map(base, [body for sent in held for body in sent.bodies], merge)
     alone, fleet = (
-        f"F1 {scored.f1():.2f} % of scored voxels" for scored in (world.single[one.vehicle], world.fleet[n])
+        f"F1 {scored.f1():.2f} % of observable voxels" for scored in (world.single[one.vehicle], world.fleet[n])
     )
     pictures = (
         ("single.png", ellipsoids_of_maps(truth.frame, base.tiles, map_of_one(base, one.reports)),
@@ -58,7 +58,7 @@ def draw_changes(outcome: SimulationOutcome, world: WorldOutcome, truth: Truth, 
 
 
 def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
-    """Draw Figure 17: F1 of scored voxels by number of vehicles; thin lines are the other two levels.
+    """Draw Figure 17: F1 of observable voxels by number of vehicles; thin lines are the other two levels.
 
     The axis is broken: the stale map lies far below everything else.
     """
@@ -66,7 +66,7 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
     axes, below = figure.add_axes((0.08, 0.27, 0.89, 0.61)), figure.add_axes((0.08, 0.095, 0.89, 0.13))
     numbers = sorted(int(n) for n in summary["fleet"])
     drawn = [*_curves(axes, summary, numbers), *_baseline(axes, summary)]
-    stale = summary["stale"]["f1"]["scored"]
+    stale = summary["stale"]["f1"]["observable"]
     below.axhline(stale, color="#2f6fb5", linewidth=1.8)
     axes.plot([], [], color="#2f6fb5", linewidth=1.8, label=f"stale map: {stale:.2f} (paper {reference.PAPER_STALE})")
     paper = {1: reference.SINGLE, **reference.FLEET_READ_OFF, **reference.FLEET}
@@ -94,7 +94,7 @@ def _curves(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> list[
     drawn: list[float] = []
     for level in reversed(LEVELS):
         values = [summary["fleet"][str(n)]["f1"][level] for n in numbers]
-        width, label = 2.4 if level == "scored" else 1.3, f"fleet, {_LEVEL_NAMES[level]}"
+        width, label = 2.4 if level == "observable" else 1.3, f"fleet, {_LEVEL_NAMES[level]}"
         axes.plot(numbers, values, _LEVEL_STYLE[level], color="#2e8b57", linewidth=width, label=label)
         drawn += values
     single, of = _one_drive(summary)
@@ -106,15 +106,15 @@ def _one_drive(summary: Mapping[str, Any]) -> tuple[float, str]:
     """Mean F1 of a drive alone and whose it is: of the 16- and 32-layer sensors, of all where none of them drove."""
     target = target_single(summary)
     if target is not None:
-        return target["scored"], "16/32 layers"
-    return float(np.mean([stage["f1"]["scored"] for stage in summary["single"].values()])), "all sensors"
+        return target["observable"], "16/32 layers"
+    return float(np.mean([stage["f1"]["observable"] for stage in summary["single"].values()])), "all sensors"
 
 
 def _spread(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> None:
     """Shade what lies between the best and the worst of several worlds."""
     worlds = list(summary.get("by_seed", {}).values())
     if worlds:
-        each = np.array([[world["fleet"][str(n)]["f1"]["scored"] for n in numbers] for world in worlds])
+        each = np.array([[world["fleet"][str(n)]["f1"]["observable"] for n in numbers] for world in worlds])
         axes.fill_between(numbers, each.min(axis=0), each.max(axis=0), color="#2e8b57", alpha=0.15, linewidth=0)
 
 
@@ -122,9 +122,9 @@ def _baseline(axes: Axes, summary: Mapping[str, Any]) -> list[float]:
     """Draw the point-cloud baseline, where it ran; give its values."""
     fleet = summary.get("pcd", {}).get("fleet", {})
     numbers = sorted(int(n) for n in fleet)
-    values = [float(fleet[str(n)]["f1"]["scored"]) for n in numbers]
+    values = [float(fleet[str(n)]["f1"]["observable"]) for n in numbers]
     if values:
-        axes.plot(numbers, values, "o-", color="#8455a8", linewidth=1.6, markersize=4, label="point clouds, scored")
+        axes.plot(numbers, values, "o-", color="#8455a8", linewidth=1.6, markersize=4, label="point clouds, observable")
     return values
 
 

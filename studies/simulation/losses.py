@@ -91,6 +91,7 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
 BASE_DIFFERS: Final = "the base map differs from the truth's"
 MARGINAL: Final = "marginal in the truth"
 TOO_FAR: Final = "hardly observable"
+SEASON: Final = "leaves or snow"
 POSES: Final = "right with true poses"
 
 
@@ -210,6 +211,7 @@ def _with_circumstances(case: LossCase, rows: I64, found: Causes, exact: ClassAr
     if exact is not None:
         found = np.where(exact[rows] == true, np.char.add(f"{POSES}; ", found), found)
     names = np.where(truth.observable[rows], found, np.char.add(f"{TOO_FAR}; ", found))
+    names = np.where(truth.seasonal[rows], np.char.add(f"{SEASON}; ", names), names)
     names = np.where(truth.clear[rows], names, np.char.add(f"{MARGINAL}; ", found))
     return np.where(was_there == case.in_base()[rows], names, BASE_DIFFERS)
 

@@ -9,7 +9,10 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from gnd.cloud_merger.merge import MergeParameters
+from gnd.fleet_sim.cars import MAX_STAY_H
 from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig
+from gnd.fleet_sim.families.names import FAMILY_NAMES
+from gnd.fleet_sim.sensing import Beams, Weather
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import StreetOptions
 from gnd.fleet_sim.traffic import Traffic
@@ -140,6 +143,7 @@ def street_option(length_m: float) -> Any:
         StreetOptions,
         length_m=(length_m, Option("Length of the street, metres.", ("--length",))),
         site=("wangsimni", Option("Where it lies: wangsimni, border or north49.")),
+        family=("street", Option(f"Kind of place: {', '.join(FAMILY_NAMES)}.")),
     )
 
 
@@ -148,7 +152,7 @@ def sensors_option(default: tuple[str, ...], text: str) -> Any:
     return option(default, text, known=SHORT_NAMES)
 
 
-PARKING: Final = "Share of parking slots that are taken."
+PARKING: Final = "Share of parking slots that are taken; by default the usual one of the family, mostly 0.2."
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,8 +168,14 @@ class RunOptions:
         read=lambda text: tuple(sorted(set(numbers("--vehicles", text)))),
     )
     sensors: tuple[str, ...] = sensors_option(tuple(SHORT_NAMES), "Sensors that the fleet cycles through.")
-    parking: float = option(0.2, PARKING, span=(0, 1))
+    parking: float | None = option(None, PARKING, span=(0, 1))
     traffic: bool = option(True, "Moving cars and pedestrians.")
+    weather: Weather = option("clear", "Weather of the drives after the changes.")
+    beams: Beams = option("ideal", "Beams of the LiDARs; real ones have a width: mixed pixels, bias, blooming signs.")
+    apart_min: float = option(60.0, "Minutes between the starts of two vehicles.", "--apart", span=(0, 1e5))
+    stay_h: float = option(
+        0.0, "Mean stay of a parked car in hours; 0: every drive meets others.", "--stay", span=(0, MAX_STAY_H)
+    )
     mode: Mode = option("default", "Whose rules.")
     poses: PoseSource = option(
         PoseSource(), "estimated, true, or noisy:<m>:<deg>; true,estimated compares.",
@@ -190,7 +200,7 @@ class RunOptions:
         return max(*self.vehicles, len(self.sensors))
 
 
-_HOUR_NS = 3_600 * 1_000_000_000
+_MINUTE_NS: Final = 60 * 1_000_000_000
 
 
 def fleet_sensors(options: RunOptions, seed: int) -> tuple[str, ...]:
@@ -214,7 +224,10 @@ def fleet_configs(options: RunOptions, seed: int) -> tuple[DriveConfig, ...]:
             car_share=options.parking,
             traffic=Traffic.urban() if options.traffic else Traffic(),
             scans=options.scans,
-            start_ns=EPOCH_NS + index * _HOUR_NS,
+            start_ns=EPOCH_NS + index * round(options.apart_min * _MINUTE_NS),
+            weather=options.weather,
+            beams=options.beams,
+            stay_h=options.stay_h,
         )
         for index, sensor in enumerate(sensors)
     )

@@ -3,7 +3,8 @@
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.merge import MergeParameters
-from gnd.fleet_sim.evaluate import CLASSES, Evaluation, Score, evaluate_maps
-from gnd.fleet_sim.truth import LEVELS, Level, read_truth
+from gnd.fleet_sim.evaluate import CLASSES, Evaluation, Score, Tiles, evaluate_maps, false_elsewhere, kept_changes
+from gnd.fleet_sim.parking import near_lanes, on_parking
+from gnd.fleet_sim.truth import CHANGES, LEVELS, Level, read_truth
+from gnd.fleet_sim.world import read_world
+from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.config import to_mapping
 from studies.frame.command import plain_options
 from studies.simulation.cloud import arrived, map_of_one, merged_map
@@ -28,31 +32,47 @@ FLEET_READ_OFF: Final = {9: 99.0}
 
 TARGET_SENSORS: Final = ("vlp16", "hdl32e", "rs16", "rs32")
 """The target of a single drive is the mean over the sensors of 16 and 32 layers."""
-MUST: Final = {"single": 88.05, "fleet.9": 96.0, "fleet.20": 97.0, "fleet.20.all": 88.0}
-AIM: Final = {"single": 94.0, "fleet.9": 99.0, "fleet.20": 99.62, "fleet.20.all": 95.0}
+MUST: Final = {"single": 94.0, "fleet.20": 97.0, "fleet.20.all": 90.0, "fleet.9.scored": 96.0, "fleet.20.scored": 97.0}
+AIM: Final = {"single": 96.0, "fleet.20": 98.5, "fleet.20.all": 92.0, "fleet.9.scored": 99.0, "fleet.20.scored": 99.62}
+"""Of observable voxels where no level is named. The paper's own F1 stands beside the scored ones."""
 
 
 STALE = "stale"
+FALSE_WHERE: Final = ("false_on_parking", "false_seasonal", "false_elsewhere")
+"""Called new on parking lanes; called changed where only leaves or snow came or went; called new near the lanes where
+no ray of the truth's dense scan came, as behind glass or under a wet road."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scored:
-    """One map compared with the truth: confusion matrices int64 (5, 5) by level, rows true, columns predicted."""
+    """One map compared with the truth.
+
+    Attributes:
+        confusion: matrices int64 (5, 5) by level, rows true, columns predicted.
+        false_where: number of unchanged voxels that are called changed, by what is there, see `FALSE_WHERE`; of all
+            voxels that the truth holds, and beside them.
+    """
 
     confusion: dict[Level, NDArray[np.int64]]
+    false_where: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, evaluation: Evaluation) -> "Scored":
+    def of(cls, evaluation: Evaluation, false_where: Mapping[str, int] | None = None) -> "Scored":
         """Keep the matrices of an evaluation."""
-        return cls({level: evaluation.scores[level].confusion for level in LEVELS})
+        return cls({level: evaluation.scores[level].confusion for level in LEVELS}, false_where or {})
 
     def score(self, level: Level) -> Score:
         """Return the score of a level."""
         return Score(level, self.confusion[level])
 
-    def f1(self, level: Level = "scored") -> float:
+    def f1(self, level: Level = "observable") -> float:
         """Return the macro F1 of a level, percent."""
         return self.score(level).macro_f1
+
+    @property
+    def kept(self) -> dict[Level, dict[str, float]]:
+        """Share of the true changes that each level keeps, percent by class."""
+        return kept_changes(self.confusion)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +87,32 @@ class VehicleFile:
         return read_result(self.path, self.key)
 
 
+class MapScorer:
+    """Compares maps of one world with its truth."""
+
+    def __init__(self, files: WorldFiles) -> None:
+        self.base = read_world_base(files)
+        self._truth, self._world = read_truth(files.truth), read_world(files.world)
+        self._parking = on_parking(self._world, self._truth)
+
+    def score(self, final: Tiles) -> Scored:
+        """Return the score of what became of the base map."""
+        truth, base = self._truth, self.base.tiles
+        evaluation = evaluate_maps(truth, base, final)
+        false = np.isin(evaluation.predicted, CHANGES) & ~np.isin(truth.change_class, CHANGES)
+        parked = false & self._parking & (evaluation.predicted == ChangeClass.NEW)
+        elsewhere = false_elsewhere(truth, base, final, partial(near_lanes, self._world))
+        where = {"false_on_parking": parked, "false_seasonal": false & truth.seasonal}
+        return Scored.of(evaluation, {n: int(v.sum()) for n, v in where.items()} | {"false_elsewhere": elsewhere})
+
+
 def score_single(files: WorldFiles, vehicles: Sequence[VehicleFile]) -> dict[str, Scored]:
     """Return the stale map's score and that of each vehicle alone, by name."""
-    truth, base = read_truth(files.truth), read_world_base(files)
-    found = {STALE: Scored.of(evaluate_maps(truth, base.tiles, base.tiles))}
+    scorer = MapScorer(files)
+    found = {STALE: scorer.score(scorer.base.tiles)}
     for vehicle in vehicles:
         result = vehicle.read()
-        found[result.vehicle] = Scored.of(evaluate_maps(truth, base.tiles, map_of_one(base, result.reports)))
+        found[result.vehicle] = scorer.score(map_of_one(scorer.base, result.reports))
     return found
 
 
@@ -85,12 +124,13 @@ def score_fleet(
     upload: Upload = "full",
 ) -> dict[int, Scored]:
     """Return the score of the merged map of the first n vehicles, for each n asked for."""
-    truth, base = read_truth(files.truth), read_world_base(files)
+    scorer = MapScorer(files)
+    base = scorer.base
     held = arrived(base, [vehicle.read() for vehicle in vehicles[: max(numbers)]], merge, upload)
     found = {}
     for n in numbers:
         bodies = [body for one in held[:n] for body in one.bodies]
-        found[n] = Scored.of(evaluate_maps(truth, base.tiles, merged_map(base, bodies, merge)))
+        found[n] = scorer.score(merged_map(base, bodies, merge))
     return found
 
 
@@ -126,9 +166,10 @@ def targets_of(found: Mapping[str, Any]) -> dict[str, dict[str, float | bool]]:
     values: dict[str, float] = {}
     single = target_single(found)
     if single is not None:
-        values["single"] = single["scored"]
+        values["single"] = single["observable"]
     for n, stage in found["fleet"].items():
-        values[f"fleet.{n}"], values[f"fleet.{n}.all"] = stage["f1"]["scored"], stage["f1"]["all"]
+        values[f"fleet.{n}"] = stage["f1"]["observable"]
+        values |= {f"fleet.{n}.{level}": stage["f1"][level] for level in LEVELS}
     return {
         name: {"value": round(values[name], 4), "must": must, "aim": AIM[name], "met": values[name] >= must}
         for name, must in MUST.items()
@@ -152,6 +193,7 @@ class WorldOutcome:
         files: where it lies.
         vehicles: results in the order of the fleet.
         kept: their files.
+        asked: the numbers of vehicles that are reported.
         single: score of the stale map and of each vehicle alone, by name.
         fleet: score of the merged map by number of vehicles.
         sent: bytes that each vehicle sends, in their order: to the fleet's cloud, and to a cloud of its own.
@@ -162,6 +204,7 @@ class WorldOutcome:
     files: WorldFiles
     vehicles: tuple[VehicleResult, ...]
     kept: tuple[VehicleFile, ...]
+    asked: tuple[int, ...]
     single: dict[str, Scored]
     fleet: dict[int, Scored]
     sent: tuple[list[int], list[int]]
@@ -199,11 +242,14 @@ def parameters_of(outcome: SimulationOutcome) -> dict[str, Any]:
 
 
 def _world_summary(world: WorldOutcome) -> dict[str, Any]:
-    by_sensor = _by_sensor(world)
+    by_sensor, largest = _by_sensor(world), world.fleet[max(world.asked)]
     return {
         "stale": _stage([world.single[STALE]]),
         "single": {sensor: _stage([world.single[name] for name in names]) for sensor, names in by_sensor.items()},
         "fleet": {str(n): _stage([scored]) for n, scored in world.fleet.items()},
+        "kept": largest.kept,
+        "false_per_1000": largest.score("observable").false_per_1000,
+        **{name: largest.false_where[name] for name in FALSE_WHERE},
         "upload_bytes": _uploads(world, by_sensor),
         **({"pcd": _pcd(world, by_sensor)} if world.pcd else {}),
         "drives": {sensor: _drives(world, names) for sensor, names in by_sensor.items()},
@@ -219,9 +265,14 @@ def _by_sensor(world: WorldOutcome) -> dict[str, list[str]]:
 
 
 def _stage(maps: Sequence[Scored]) -> dict[str, Any]:
-    """Mean over maps of F1 at the three levels, and of the classes' scores at each."""
-    f1 = {level: _mean(scored.f1(level) for scored in maps) for level in LEVELS}
-    return {"f1": f1, "classes": {level: mean_of([_classes(scored, level) for scored in maps]) for level in LEVELS}}
+    """Mean over maps of F1 at the three levels and of the classes' scores at each, and of false changes."""
+    return {
+        "f1": {level: _mean(scored.f1(level) for scored in maps) for level in LEVELS},
+        "changes_f1": {level: _mean(scored.score(level).changes_f1 for scored in maps) for level in LEVELS},
+        "false_per_1000": mean_of([scored.score("observable").false_per_1000 for scored in maps]),
+        **{name: _mean(float(scored.false_where.get(name, 0)) for scored in maps) for name in FALSE_WHERE},
+        "classes": {level: mean_of([_classes(scored, level) for scored in maps]) for level in LEVELS},
+    }
 
 
 def _classes(scored: Scored, level: Any) -> dict[str, Any]:
@@ -321,7 +372,8 @@ def comparison_of(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
     Returns:
         `poses.<name>`: the run; `loss.<name>.<row>.<level>`: points of F1 that it loses against the first, negative
-        where it gains; `worst.<name>`: the largest loss among scored voxels, its row, and whether it is small enough.
+        where it gains; `worst.<name>`: the largest loss among observable voxels, its row, and whether that is little
+        enough.
     """
     against, *others = runs
     exact, loss = rows_of(runs[against]), dict[str, dict[str, dict[str, float]]]()
@@ -334,7 +386,7 @@ def comparison_of(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def worst_loss(loss: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """Return the row that loses most among scored voxels, its points, and whether it meets `MUST_LOSE_AT_MOST`."""
-    row = max(loss, key=lambda name: loss[name]["scored"])
-    points = loss[row]["scored"]
+    """Return the row that loses most among observable voxels, its points, and whether it meets `MUST_LOSE_AT_MOST`."""
+    row = max(loss, key=lambda name: loss[name]["observable"])
+    points = loss[row]["observable"]
     return {"row": row, "loss": points, "must": MUST_LOSE_AT_MOST, "met": points <= MUST_LOSE_AT_MOST}

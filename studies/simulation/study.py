@@ -137,7 +137,7 @@ def _scores(
         sent = next(results)
         pcd = next(results) if options.pcd else {}
         read = tuple(vehicle.read() for vehicle in of_world)
-        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), single, fleet, sent, pcd))
+        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), options.vehicles, single, fleet, sent, pcd))
     return tuple(found)
 
 

@@ -16,11 +16,11 @@ PCD_CODEC: Final = "points"
 def sheets_of(found: Found, asked: Sequence[int]) -> list[Sheet]:
     """Return the scores, the classes of the largest fleet, and its confusion matrix."""
     largest, classes = str(max(asked)), {name: f"{{{name}:.2f}}" for name in ("precision", "recall", "f1")}
-    title = f"Classes of the merged map, {largest} vehicles, scored voxels"
-    of_classes = sheet_of(title, classes, found["fleet"][largest]["classes"]["scored"])
+    title = f"Classes of the merged map, {largest} vehicles, observable voxels"
+    of_classes = sheet_of(title, classes, found["fleet"][largest]["classes"]["observable"])
     names = found["confusion"]["classes"]
-    confusion = sheet(f"Confusion, {largest} vehicles, scored voxels (rows: truth)", "", *names)
-    for name, row in zip(names, found["confusion"]["fleet"][largest]["scored"], strict=True):
+    confusion = sheet(f"Confusion, {largest} vehicles, observable voxels (rows: truth)", "", *names)
+    for name, row in zip(names, found["confusion"]["fleet"][largest]["observable"], strict=True):
         confusion.add(name, *(f"{value:,}" for value in row))
     confusion.notes += notes_of(found)
     return [_scores(found, asked), of_classes, confusion]
@@ -42,13 +42,15 @@ def _losses(compared: Found, name: str, asked: Sequence[int]) -> Sheet:
     against = compared["against"]
     exact, other = rows_of(compared["poses"][against]), rows_of(compared["poses"][name])
     seeds = ", ".join(map(str, compared["poses"][name]["seeds"]))
-    columns = [f"{level} {what}" for level in ("scored", "all") for what in (against, name, "loss")]
+    columns = [f"{level} {what}" for level in ("observable", "all") for what in (against, name, "loss")]
     table = sheet(f"Macro F1 in percent, world seed {seeds}: poses {against} and {name}", "", *columns)
     for row, loss in compared["loss"][name].items():
         kind, _, number = row.partition(".")
         if kind != "fleet" or int(number) in asked:
             values = [
-                value for level in ("scored", "all") for value in (exact[row][level], other[row][level], loss[level])
+                value
+                for level in ("observable", "all")
+                for value in (exact[row][level], other[row][level], loss[level])
             ]
             table.add(_vehicles(int(number)) if kind == "fleet" else f"one drive, {number or '16/32 layers'}",
                       *map(fixed, values))  # fmt: skip
@@ -70,8 +72,8 @@ def _poses(found: Found, name: str) -> Sheet:
 def _scores(found: Found, asked: Sequence[int]) -> Sheet:
     seeds, options = ", ".join(map(str, found["seeds"])), found["parameters"]
     title = f"Macro F1 in percent, world seed {seeds}: {options['mode']}, poses {options['poses']}"
-    levels = [level.replace("_", " ") for level in LEVELS]
-    table, up = sheet(title, "", *levels, "paper", "must", "aim", "upload kB"), found["upload_bytes"]
+    columns = (*LEVELS, "changes", "paper", "must", "aim", "upload kB")
+    table, up = sheet(title, "", *columns), found["upload_bytes"]
     must, aim = reference.MUST, reference.AIM
     table.add("stale map", *_f1(found["stale"]), reference.PAPER_STALE)
     for sensor, stage in found["single"].items():
@@ -79,7 +81,9 @@ def _scores(found: Found, asked: Sequence[int]) -> Sheet:
     target = target_single(found)
     if target:
         single = (reference.SINGLE, must["single"], aim["single"])
-        table.add("one drive, 16/32 layers", *_f1({"f1": target}), *single, style="bold")
+        table.add(
+            "one drive, 16/32 layers", *map(fixed, (target[level] for level in LEVELS)), "", *single, style="bold"
+        )
     for n in asked:
         name, paper = f"fleet.{n}", {**reference.FLEET, **reference.FLEET_READ_OFF}.get(n, "")
         limits = (paper, must.get(name, ""), aim.get(name, ""))
@@ -91,10 +95,24 @@ def _scores(found: Found, asked: Sequence[int]) -> Sheet:
     return table
 
 
+def _where(found: Found) -> str:
+    words = ("new on parking lanes", "by the season", "new where nothing is")
+    counts = (found[name] for name in reference.FALSE_WHERE)
+    return ", ".join(f"{count:g} {what}" for count, what in zip(counts, words, strict=True))
+
+
+def kept_line(kept: Found) -> str:
+    """Return what the levels leave out of the true changes, which every F1 beside them needs."""
+    left = {level: ", ".join(f"{100 - share:.0f} % of {name}" for name, share in kept[level].items()) for level in kept}
+    return "Of the true changes " + "; ".join(f"{level} leaves out {what}" for level, what in left.items()) + "."
+
+
 def notes_of(found: Found) -> list[str]:
     """Return a line each on movers and on upload against the baseline."""
     counts = [drive["segmentation"] for drive in found["drives"].values() if drive.get("segmentation")]
-    lines = []
+    lines = [kept_line(found["kept"])]
+    false = ", ".join(f"{count:.2f} {name}" for name, count in found["false_per_1000"].items())
+    lines.append(f"False changes of 1,000 observable voxels: {false}; {_where(found)}.")
     total = {name: sum(count[name] for count in counts) for name in (counts[0] if counts else ())}
     if total and total["movers"]:
         left, lost = 100 * total["movers_left"] / total["movers"], 100 * total["static_lost"] / total["static"]
@@ -109,7 +127,8 @@ def notes_of(found: Found) -> list[str]:
 
 
 def _f1(stage: Found) -> list[str]:
-    return [fixed(stage["f1"][level]) for level in LEVELS]
+    """F1 at the levels, and over the three classes of change among observable voxels."""
+    return [*(fixed(stage["f1"][level]) for level in LEVELS), fixed(stage["changes_f1"]["observable"])]
 
 
 def _kb(size: float) -> str:

@@ -66,7 +66,8 @@ def world_name(seed: int, options: StreetOptions) -> str:
     """Return the name of a world's folder."""
     place = options.site if options.lat_deg is None else f"{options.lat_deg:g}N{options.lon_deg:g}E"
     edits = "" if options.edit_share == 1.0 else f"-edits{100 * options.edit_share:g}"
-    return f"seed-{seed}-{options.length_m:g}m-{place}{edits}"
+    family = "" if options.family == "street" else f"-{options.family}"
+    return f"seed-{seed}{family}-{options.length_m:g}m-{place}{edits}"
 
 
 def world_files(folder: StudyFolder, seed: int, options: RunOptions) -> WorldFiles:

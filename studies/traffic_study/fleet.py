@@ -1,6 +1,6 @@
 """The drives of a study, one after the other through the same cloud: what each uploads, what map comes of it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig
 from gnd.fleet_sim.evaluate import evaluate_maps
 from gnd.fleet_sim.traffic import Traffic
-from gnd.fleet_sim.truth import Level, Truth, read_truth
+from gnd.fleet_sim.truth import LEVELS, Level, Truth, read_truth
 from gnd.gnd_map.codec import Lattice, snap
 from gnd.gnd_map.config import to_mapping
 from studies.frame.command import Bench
@@ -171,5 +171,4 @@ def _published(base: BaseMap, lattice: Lattice | None) -> BaseMap:
 
 def _f1(truth: Truth, base: BaseMap, final: BaseMap) -> dict[Level, float]:
     scored = Scored.of(evaluate_maps(truth, base.tiles, final.tiles))
-    levels: Sequence[Level] = ("all", "marginal_excluded", "scored")
-    return {level: scored.f1(level) for level in levels}
+    return {level: scored.f1(level) for level in LEVELS}

@@ -38,6 +38,8 @@ def test_an_unknown_key_is_named(tmp_path: Path) -> None:
         {"deadline_s": 0.0},
         {"headway_s": -1.0},
         {"headway_s": float("nan")},
+        {"family": "mars"},
+        {"parking": 1.5},
     ],
 )
 def test_values_out_of_range_are_refused(overrides: dict[str, object]) -> None:

@@ -46,7 +46,7 @@ def truth() -> Truth:
     return Truth(
         world_sha="", plan=ScanPlan(), frame=LocalFrame.of_tile(TILE), morton=np.full(5, TILE.morton, np.int64),
         voxel_id=np.arange(1, 6, dtype=np.int32), change_class=classes.astype(np.uint8), clear=clear,
-        observable=np.ones(5, np.bool_), before={TILE: BASE}, after={TILE: HEALED},
+        observable=np.ones(5, np.bool_), seasonal=np.zeros(5, np.bool_), before={TILE: BASE}, after={TILE: HEALED},
     )  # fmt: skip
 
 

@@ -1,7 +1,5 @@
 """From counters to classes, voxel by voxel, and to what is reported."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from vehicle_scene import FIGURE_2
@@ -12,7 +10,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.schemas.changes import TileChange
 from gnd.vehicle_agent.detect.classify import Classification, classify, tile_change
 from gnd.vehicle_agent.detect.evidence import TileEvidence
-from gnd.vehicle_agent.detect.parameters import MEASURED_RULES, DetectParameters
+from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
 PLANE = (0.0008, 0.0, 0.0, 0.08, 0.0, 0.08)  # upright, facing x
@@ -85,10 +83,24 @@ def test_the_class_follows_from_the_counters(evidence: TileEvidence, default: st
     assert said(evidence, DetectParameters.paper()) == paper
 
 
-def test_deletion_needs_rays_that_passed_whatever_the_other_evidence() -> None:
-    p = DetectParameters(own_rules=replace(MEASURED_RULES, min_pass_inside=1))
+def test_deletion_needs_more_rays_that_passed_than_chance_explains() -> None:
+    """A plane stops at least a quarter of the rays through it, by the least that a Gaussian is taken to stop."""
+    p = DetectParameters()
     assert said(one(in_map=True, bo=100, cells=0), p) == "UNMEASURED"
-    assert said(one(in_map=True, bo=100, pi=1, cells=0), p) == "DELETED"
+    assert said(one(in_map=True, pi=13), p) == "UNMEASURED"
+    assert said(one(in_map=True, pi=14), p) == "DELETED"
+    assert said(one(in_map=True, pi=30, bo=4, cells=4), p) == "UNMEASURED"  # 4 hits of 34: as through a fence
+    assert said(one(in_map=True, pi=60, bo=4, cells=4), p) == "DELETED"
+
+
+def test_a_new_gaussian_must_be_more_than_a_matter_of_sampling() -> None:
+    """24 sub-cells of 200 points are all that there is; of 24 points they may be any number."""
+    p = DetectParameters()
+    assert said(one(in_map=False, be=200, cells=24), p) == "NEW"
+    assert said(one(in_map=False, be=24, cells=24, pe=200), p) != "NEW"
+    assert said(one(in_map=False, be=36, cells=36), p) == "NEW"
+    assert said(one(in_map=False, be=35, cells=35), p) != "NEW"
+    assert said(one(in_map=False, be=2000, cells=19), p) != "NEW"  # no Gaussian at all
 
 
 def several() -> tuple[TileEvidence, Classification]:

@@ -1,4 +1,4 @@
-"""Edges of known surfaces: who continues a planar Gaussian next door, beside a plain search through all pairs."""
+"""Edges of what the map holds: who continues a Gaussian next door, beside a plain search; cells at half the points."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from vehicle_scene import FIGURE_2
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
-from gnd.vehicle_agent.detect.extension import DETECT_EDGE_M, extends_neighbour
+from gnd.vehicle_agent.detect.extension import DETECT_EDGE_M, cells_at_half, extends_neighbour
 from gnd.vehicle_agent.detect.records import planar_normals
 
 TILE = FIGURE_2[0]
@@ -73,3 +73,19 @@ def test_a_plain_search_through_all_pairs_finds_the_same() -> None:
     ]
     assert extends_neighbour(Tile(TILE, 1, base), new).tolist() == expected
     assert 0 < sum(expected) < len(new)
+
+
+@pytest.mark.parametrize(("K", "n"), [(25, 400), (40, 80), (100, 60), (300, 40)])
+def test_sub_cells_at_half_the_points_are_those_of_points_thrown_at_random(K: int, n: int) -> None:
+    rng = np.random.default_rng(K)
+    thrown = rng.integers(0, K, (2000, n))
+    whole, half = (np.mean([len(np.unique(row[:m])) for row in thrown]) for m in (n, n // 2))
+    assert cells_at_half(np.array([round(whole)], np.int32), np.array([n], np.int32))[0] == pytest.approx(
+        half, rel=0.05
+    )
+
+
+def test_sub_cells_at_half_the_points_lie_between_half_and_all() -> None:
+    cells = np.array([1, 30, 30, 30, 0], np.int32)
+    found = cells_at_half(cells, np.array([1, 30, 60, 100_000, 0], np.int32))
+    np.testing.assert_allclose(found, [0.5, 15.0, 20.7, 30.0, 0.0], atol=0.1)

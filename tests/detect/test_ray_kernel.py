@@ -147,7 +147,7 @@ def test_quantile_is_scipys_chi_square_with_three_degrees_of_freedom(eta: float)
     assert confidence(quantile(eta)) == pytest.approx(eta, abs=1e-12)
 
 
-@pytest.mark.parametrize("bad", [{"range_min_m": -0.1}, {"range_max_m": 1.0}, {"new_cells": 10}])
+@pytest.mark.parametrize("bad", [{"range_min_m": -0.1}, {"range_max_m": 1.0}, {"new_cells": 9}])
 def test_parameters_out_of_range_are_refused_with_their_value(bad: dict[str, float]) -> None:
     (name, value) = next(iter(bad.items()))
     with pytest.raises(DetectParameterError, match=f"{name} = {value}"):

@@ -52,7 +52,7 @@ def test_the_unchanged_cloud_gives_the_truths_gaussians(cloud, truth):
         alike = similarity(a.exists, a.mean_m, a.cov_m2, b.exists, b.mean_m, b.cov_m2)
         assert alike.min() > 0.5
         assert np.median(alike) > 0.97
-    for level in ("all", "marginal_excluded", "scored"):
+    for level in ("all", "observable", "scored"):
         base = evaluate_maps(truth, truth.before, truth.before).f1(level)
         assert evaluate_gnd(truth, found, found).f1(level) == base
 

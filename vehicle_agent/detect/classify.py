@@ -12,8 +12,9 @@ from gnd.gnd_map.evidence import ChangeState, masses, states
 from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.schemas.changes import TileChange
 from gnd.vehicle_agent.detect.evidence import TileEvidence
-from gnd.vehicle_agent.detect.extension import extends_neighbour
+from gnd.vehicle_agent.detect.extension import cells_at_half, extends_neighbour
 from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
+from gnd.vehicle_agent.detect.permeable import is_gone
 from gnd.vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
 
 _MANY_RAYS: Final = 100
@@ -47,7 +48,8 @@ def classify(evidence: TileEvidence, parameters: DetectParameters) -> Classifica
 
     The state is the largest mass after Eq. (11); a voxel is new, modified or deleted when it is `changed`. `default`
     mode adds: a new Gaussian of the map's shape keeps the voxel normal, one of another shape makes even a sustained
-    voxel modified (`shape_change`); deletion needs rays that passed; too few hits, too few rays or a tie abstain.
+    voxel modified (`shape_change`); deletion needs fewer hits than chance explains (`permeable`); a new Gaussian must
+    be more than the edge of a known surface (`extension`); too few hits, too few rays or a tie abstain.
     """
     decide = _decide_paper if parameters.mode == "paper" else _decide_default
     return Classification(evidence, decide(evidence, parameters).astype(np.uint8))
@@ -83,7 +85,9 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     has_gaussian = e.measured.cells >= MIN_CELLS
     sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
     reshaped = has_gaussian & ~_same_shape(e, p)
-    gone = changed & (e.measured.cells < p.rules.weak_cells) & (e.n_pi >= p.rules.min_pass_inside)
+    gone = changed & (e.measured.cells < p.rules.weak_cells)
+    rows = np.flatnonzero(gone & e.in_map)
+    gone[rows] = is_gone(e.base.gaussians.take(e.map_row[rows]), (e.n_bi + e.n_bo)[rows], e.n_pi[rows])
     return np.select(
         [reshaped & (sustained | changed), sustained | (changed & has_gaussian), gone],
         [ChangeClass.MODIFIED, ChangeClass.NORMAL, ChangeClass.DELETED],
@@ -93,19 +97,18 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 
 def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """Voxels in which the map has none: new or empty; few passes abstain, and weak hits unless many rays looked."""
-    new = e.measured.cells >= _least_cells_of_new(e, p)
     weak = (e.measured.cells >= p.rules.weak_cells) & (e.n_pe + e.n_be < _MANY_RAYS)
     empty = ~weak & (e.measured.cells < _EMPTY_CELLS) & (e.n_pe >= p.rules.min_passes)
-    return np.select([new, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
+    return np.select([_is_new(e, p), empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
 
 
-def _least_cells_of_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
-    """(K,) sub-cells that make a new Gaussian: more where it may be the edge of a surface that the map holds."""
-    least = np.full(len(e), p.new_cells)
-    rows = np.flatnonzero(~e.in_map & (e.measured.cells >= p.new_cells) & (e.measured.cells < p.new_cells_at_edge))
-    edge = extends_neighbour(e.base, e.measured.take(rows))
-    least[rows[edge]] = p.new_cells_at_edge
-    return least
+def _is_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
+    """(K,) whether half as many points would have shown a new Gaussian, too; at the edge of a known surface, more."""
+    cells = cells_at_half(e.measured.cells, e.measured.count)
+    new = ~e.in_map & (e.measured.cells >= MIN_CELLS) & (cells >= p.new_cells)
+    rows = np.flatnonzero(new & (cells < p.new_cells_at_edge))
+    new[rows] = ~extends_neighbour(e.base, e.measured.take(rows))
+    return np.asarray(new)
 
 
 def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
-"""Whether what was measured in an empty voxel is only the edge of a surface that the map holds next door.
+"""Whether what was measured in an empty voxel is more than the edge of a surface that the map holds next door.
 
 Map and vehicle sample such an edge differently, and the least number of sub-cells decides by a hair: on real scans
-more than four in five false new voxels lay there.
+more than four in five false new voxels lay there, and most of their sub-cells held a single point.
 """
 
 from itertools import product
@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import I32
+from gnd.gnd_map.arrays import F64, I32
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
@@ -18,8 +18,26 @@ from gnd.vehicle_agent.detect.records import planar_normals
 
 DETECT_EDGE_M: Final = 0.15
 """So near to the plane of a planar Gaussian next door a voxel lies at the edge of a known surface."""
+_X: Final = np.linspace(1e-6, 60.0, 6001)
+_POINTS_PER_CELL: Final = _X / -np.expm1(-_X)
 
 _AROUND: Final = tuple(step for step in product((-1, 0, 1), repeat=3) if any(step))
+
+
+def cells_at_half(cells: I32, count: I32) -> F64:
+    """(K,) how many sub-cells half as many points would have filled.
+
+    A number of sub-cells depends on how often a place was hit. Points that fall on K sub-cells at random fill
+    K (1 - exp(-n / K)) of them; n and the filled ones give K, and that the number at n / 2. Where each sub-cell holds
+    many points it is all of them, where each holds one it is half.
+
+    Args:
+        cells: (K,) sub-cells with points.
+        count: (K,) points.
+    """
+    ratio = np.maximum(count, cells) / np.maximum(cells, 1)
+    x = np.interp(ratio, _POINTS_PER_CELL, _X)  # n / K
+    return np.asarray(cells / (1.0 + np.exp(-0.5 * x)), np.float64)
 
 
 def extends_neighbour(base: Tile, measured: Gaussians) -> NDArray[np.bool_]:
@@ -30,7 +48,6 @@ def extends_neighbour(base: Tile, measured: Gaussians) -> NDArray[np.bool_]:
     Args:
         base: the tile's map.
         measured: K voxels of the same tile.
-        parameters: what is planar, and `edge_m`: how near to that plane the measured mean lies.
     """
     found = np.zeros(len(measured), np.bool_)
     if not len(measured) or not len(base.gaussians):

@@ -33,7 +33,6 @@ class DetectRules:
         face_m: a blocked point this close to a face is ignored where the neighbour's Gaussian explains it; 0: none is.
         weak_cells: from here on a voxel has hits, but too few for a Gaussian: it abstains.
         min_passes: rays through an empty voxel before it counts as observed empty.
-        min_pass_inside: rays through a Gaussian (PI) that a deletion needs.
         soft: whether the uncertainty of the poses softens the evidence.
     """
 
@@ -43,18 +42,15 @@ class DetectRules:
     face_m: float
     weak_cells: int
     min_passes: int
-    min_pass_inside: int
     soft: bool
 
 
 PAPER_RULES: Final = DetectRules(
-    block_noise_m=0.01, passing_rule="ml", eta_pass=0.95, face_m=0.0, weak_cells=1, min_passes=1, min_pass_inside=1,
-    soft=False,
+    block_noise_m=0.01, passing_rule="ml", eta_pass=0.95, face_m=0.0, weak_cells=1, min_passes=1, soft=False,
 )  # fmt: skip
 """Eq. (1) to (12) plainly: 1 cm keeps Σ invertible, every hit counts, evidence alone decides."""
 MEASURED_RULES: Final = DetectRules(
-    block_noise_m=0.05, passing_rule="plane", eta_pass=0.9, face_m=0.10, weak_cells=5, min_passes=3, min_pass_inside=3,
-    soft=True,
+    block_noise_m=0.05, passing_rule="plane", eta_pass=0.9, face_m=0.10, weak_cells=5, min_passes=3, soft=True,
 )  # fmt: skip
 """What was measured to help: thin covariances turn 3 cm of noise into outside (`block_noise_m`)."""
 
@@ -85,11 +81,10 @@ class DetectParameters:
         below=500,
     )
     new_cells: int = setting(
-        30,
-        "Occupied 10 cm sub-cells that make a Gaussian where the map has none, 1.5 times as many at the edge of a known"
-        " surface: noise and the error of poses thicken a surface, on real scans nine in ten false new voxels had fewer"
-        " than 38.",
-        least=MIN_CELLS,
+        18,
+        "Occupied 10 cm sub-cells that make a Gaussian where the map has none, as many as half of the points would"
+        " fill; twice as many at the edge of a known surface: noise and the error of poses thicken it.",
+        least=10,
         most=1000,
     )
     own_rules: DetectRules | None = None
@@ -108,7 +103,7 @@ class DetectParameters:
     @property
     def new_cells_at_edge(self) -> int:
         """`new_cells` at the edge of a known surface: within 15 cm of the plane of a planar Gaussian next door."""
-        return self.new_cells * 3 // 2
+        return self.new_cells * 2
 
     def excess_m2(self, pose: PoseUncertainty) -> float:
         """Variance of points at the pose's range beyond what `block_noise_m` and the others stand for."""

@@ -17,7 +17,7 @@ from gnd.gnd_map.errors import GndError
 from studies.simulation import vehicle as vehicle_module
 
 Finished = tuple[Path, dict[str, Any]]
-LEVELS = {"all", "marginal_excluded", "scored"}
+LEVELS = {"all", "observable", "scored"}
 
 
 def test_json_has_the_keys_of_the_issue(finished: Finished) -> None:
@@ -28,6 +28,12 @@ def test_json_has_the_keys_of_the_issue(finished: Finished) -> None:
     assert set(found["fleet"]) == {"1", "2"}
     assert all(set(stage["f1"]) == LEVELS for stage in found["fleet"].values())
     assert {"confusion", "parameters", "seeds", "runtime_s", "upload_bytes"} <= set(found)
+    assert set(found["kept"]) == {"observable", "scored"}
+    for level in found["kept"]:
+        assert set(found["kept"][level]) == {"new", "modified", "deleted"}
+    assert all(found["kept"]["observable"][c] >= found["kept"]["scored"][c] > 0.0 for c in found["kept"]["scored"])
+    assert set(found["false_per_1000"]) == {"new", "modified", "deleted"}
+    assert found["false_on_parking"] == found["fleet"]["2"]["false_on_parking"] >= 0
     assert found["seeds"] == [5]
     assert np.array(found["confusion"]["fleet"]["2"]["scored"]).shape == (5, 5)
     assert found["parameters"]["method"]["detect"]["mode"] == "default"
@@ -46,6 +52,23 @@ def test_the_confusion_matrix_is_that_of_the_f1(finished: Finished) -> None:
     hits, truth, predicted = np.diag(matrix), matrix.sum(axis=1), matrix.sum(axis=0)
     f1 = 100 * 2 * hits / (truth + predicted)
     assert found["fleet"]["2"]["f1"]["scored"] == pytest.approx(f1.mean(), abs=1e-3)
+
+
+def test_what_a_level_keeps_and_calls_false_is_that_of_the_confusion(finished: Finished) -> None:
+    _, found = finished
+    matrices = {level: np.array(found["confusion"]["fleet"]["2"][level], float) for level in LEVELS}
+    names = found["confusion"]["classes"]
+    for level, kept in found["kept"].items():
+        for name, share in kept.items():
+            row = names.index(name)
+            assert share == pytest.approx(100 * matrices[level][row].sum() / matrices["all"][row].sum(), abs=1e-3)
+    seen = matrices["observable"]
+    holding = seen.sum() - seen[names.index("empty")].sum()
+    for name, count in found["false_per_1000"].items():
+        false = seen[[names.index("normal"), names.index("empty")], names.index(name)].sum()
+        assert count == pytest.approx(1000 * false / holding, abs=1e-3)
+    f1 = [found["fleet"]["2"]["classes"]["observable"][name]["f1"] for name in ("new", "modified", "deleted")]
+    assert found["fleet"]["2"]["changes_f1"]["observable"] == pytest.approx(np.mean(f1), abs=1e-3)
 
 
 def test_an_interrupted_run_continues_to_the_same_bits(

@@ -4,9 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gnd.fleet_sim.drives import EPOCH_NS
+from gnd.fleet_sim.street import StreetOptions
 from gnd.gnd_map.config import to_mapping
 from studies.frame.errors import OptionError
 from studies.simulation.options import MethodParameters, PoseSource, RunOptions, fleet_configs, fleet_sensors
+from studies.simulation.worlds import world_name
 
 
 @pytest.mark.parametrize(
@@ -98,3 +101,16 @@ def test_the_first_vehicles_stay_when_a_fleet_grows() -> None:
 def test_every_sensor_drives_at_least_once() -> None:
     assert RunOptions(vehicles=(1,)).fleet_size == 6
     assert set(fleet_sensors(RunOptions(vehicles=(1,)), 1)) == set(RunOptions().sensors)
+
+
+def test_a_family_has_a_folder_of_its_own_and_drives_take_what_is_asked_for() -> None:
+    options = RunOptions(
+        street=StreetOptions(200.0, "wangsimni", family="avenue"), vehicles=(3,), sensors=("vlp16",),
+        weather="rain", beams="real", stay_h=2.0, apart_min=20.0,
+    )  # fmt: skip
+    assert world_name(5, options.street) == "seed-5-avenue-200m-wangsimni"
+    assert world_name(5, StreetOptions(200.0, "wangsimni")) == "seed-5-200m-wangsimni"
+    drives = fleet_configs(options, 5)
+    assert [(d.weather, d.beams, d.stay_h, d.car_share) for d in drives] == [("rain", "real", 2.0, None)] * 3
+    assert [(d.start_ns - drives[0].start_ns) / 60e9 for d in drives] == [0.0, 20.0, 40.0]
+    assert [d.start_ns - EPOCH_NS for d in fleet_configs(RunOptions(), 5)][:2] == [0, 3_600 * 10**9]

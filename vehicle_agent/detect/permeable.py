@@ -1,0 +1,44 @@
+"""Whether a Gaussian of the map is gone, or rays pass through it as they always did.
+
+Leaves, bushes, wire and the rims of things stop only a part of the rays that meet them: on real recordings seven in ten
+false deletions were Gaussians that most rays of the mapping drive itself had passed. Far from the vehicle few rays meet
+such a Gaussian, and that all of them pass is chance, not change. So it is gone only where so few hits of so many rays
+are improbable for what stops the least that such a Gaussian may stop.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtr
+
+from gnd.gnd_map.arrays import F64, I32
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.vehicle_agent.detect.records import planar_normals
+
+OPACITY_OF_SURFACE: Final = 0.25
+"""Of the rays through it, a planar Gaussian stops at least this share: 14 passes without a hit delete it, as Eq. (11)
+does with the default λcp."""
+OPACITY_OF_VOLUME: Final = 0.10
+"""The same of a Gaussian that is no plane: 38 passes without a hit delete it."""
+_CHANCE: Final = 0.02
+"""So improbable the few hits must be."""
+
+
+def least_opacity(gaussians: Gaussians) -> F64:
+    """(K,) least share of the rays through each Gaussian that it stops."""
+    planar = planar_normals(gaussians.full_cov()).any(axis=1)
+    return np.where(planar, OPACITY_OF_SURFACE, OPACITY_OF_VOLUME)
+
+
+def is_gone(gaussians: Gaussians, hits: I32, passes: I32) -> NDArray[np.bool_]:
+    """(K,) whether so few hits show that a Gaussian is not there any more.
+
+    The number of hits is binomial; the test is one-sided at 2 %.
+
+    Args:
+        gaussians: K of the map.
+        hits: (K,) rays that ended in its voxel.
+        passes: (K,) rays that passed through the Gaussian.
+    """
+    return np.asarray(bdtr(hits, hits + passes, least_opacity(gaussians)) <= _CHANCE)
