@@ -3,12 +3,14 @@ nothing moves by a hair.
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
+from gnd.cloud_merger.features.drive_shift import DriveShift
 from gnd.cloud_merger.features.existence import prior_of, verdict
 from gnd.cloud_merger.features.memory import Own, Vote
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
@@ -94,6 +96,9 @@ class Story:
         self._prior = prior_of(track)
         self.masses = self._prior
         self._state: PlaceEstimate | None = self.known
+        self._shift = DriveShift()
+        if self.known is not None and track.is_point:
+            self._shift.add(self.known, self._known_drives)
         self._is_stale = bool(self.measured)
         self._longest_m = max((length_of(place.points_m) for place in self._places()), default=0.0)
         self._least_m2 = {vehicle: self._fused(own).least_m2 for vehicle, own in self.measured.items()}
@@ -166,6 +171,7 @@ class Story:
             self._is_stale = True
         elif not self._is_stale:
             self._state = place if self._state is None else step(self._state, place)
+            self._shift_by([place])
         self._confirm()
         return is_new
 
@@ -192,10 +198,34 @@ class Story:
         return fused(own.place, own.repeats, self._parameters.information_of(own.repeats))
 
     def place(self) -> PlaceEstimate:
-        """The estimate of all vehicles, each with what its measurements say together."""
+        """The estimate of all vehicles, each with what its measurements say together and a shift of its own."""
+        state, added_m2 = self._unshifted(), self._shift.added_m2()
+        if not added_m2.any():
+            return state
+        cov = state.cov_m2.copy()
+        cov[:2, :2] += added_m2
+        return PlaceEstimate(state.points_m, cov)
+
+    def _unshifted(self) -> PlaceEstimate:
+        """The same, if each drive's covariance were all that it is off by."""
         if self._is_stale or self._state is None:
-            self._state, self._is_stale = self._estimate(list(self.balanced().values())), False
+            each = list(self.balanced().values())
+            self._state, self._is_stale = self._estimate(list(each)), False
+            self._shift = DriveShift()
+            if self.known is not None and self.track.is_point:
+                self._shift.add(self.known, self._known_drives)
+            self._shift_by(each)
         return self._state
+
+    @property
+    def _known_drives(self) -> int:
+        """How many vehicles' measurements what is known already holds."""
+        epoch = self.track.epoch
+        return max(self.vehicles_before + (0 if epoch is None else epoch.vehicles), 1)
+
+    def _shift_by(self, places: Iterable[PlaceEstimate]) -> None:
+        for place in places if self.track.is_point else ():
+            self._shift.add(place)
 
     def balanced(self) -> dict[str, PlaceEstimate]:
         """What the measurements of each vehicle say together, and weigh beside those of the others."""
@@ -251,11 +281,14 @@ class Story:
             self.shown = replace(shown, existence=self.masses)
 
     def _is_worth_it(self, shown: Feature) -> bool:
-        """Whether the estimate is surer than the published one by the gain, or farther from it than its sigma."""
+        """Whether the estimate is surer than the published one by the gain, or less sure, or farther from it than its
+        sigma.
+        """
         place, was = self.place(), full_covariance(shown.cov_m2)
         gain = self._parameters.renewal_gain
         before, after = (np.minimum(np.diag(cov), HEIGHT_KNOWN_M2) for cov in (was, place.cov_m2))
-        if gain == 1.0 or (before >= gain * after * (1 - 1e-9)).any():
+        without_shift = np.minimum(np.diag(self._unshifted().cov_m2), HEIGHT_KNOWN_M2)
+        if gain == 1.0 or (before >= gain * without_shift * (1 - 1e-9)).any() or (after > gain * before).any():
             return True
         if len(place.points_m) != len(shown.points_m):
             return True

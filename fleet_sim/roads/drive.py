@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gnd.fleet_sim.drives import EPOCH_NS, SensorErrors
 from gnd.fleet_sim.errors import RoadError
 from gnd.fleet_sim.roads.curve import FloatArray
+from gnd.fleet_sim.roads.hard_noise import HardNoise, erring_profile, hard_looks
 from gnd.fleet_sim.roads.looks import DetectorNoise, detected, lane_looks
 from gnd.fleet_sim.roads.motion import Cruise, RoadMotion
 from gnd.fleet_sim.roads.route import IntArray, Route
@@ -53,6 +54,7 @@ class RoadDriveOptions:
         gnss_bias_m: standard deviation of a constant error of each axis of the GNSS, drawn for each drive, on top.
         points: noise of the detector of point features.
         lanes: noise of the lane camera.
+        hard: what the detector of point features errs by besides; None: white noise of known sigma is all.
         view: what looks for point features; None: a camera for the layer "signs", else a LiDAR.
         lane_view: the lane camera's field of view.
         traffic: other vehicles; None: the usual ones on motorways, none on a closed track.
@@ -65,6 +67,7 @@ class RoadDriveOptions:
     gnss_bias_m: float = 0.0
     points: DetectorNoise = field(default_factory=DetectorNoise)
     lanes: DetectorNoise = field(default_factory=lambda: DetectorNoise(false_alarms=0.0))
+    hard: HardNoise | None = None
     view: CameraView | None = None
     lane_view: CameraView = CAMERA
     traffic: RoadTraffic | None = None
@@ -174,14 +177,14 @@ def drive_route(route: Route, seed: int, options: RoadDriveOptions | None = None
     options = options or RoadDriveOptions()
     if seed < 0:
         raise RoadError(f"the seed of a drive must be >= 0, got {seed}")
-    names = ("style", "traffic", "motion", "gnss", "points", "lanes")
+    names = ("style", "traffic", "motion", "gnss", "points", "lanes", "hard", "profile")
     streams = {name: np.random.default_rng([seed, route.seed, k, 9]) for k, name in enumerate(names)}
     motion, boxes = _driven(route, options, streams)
     lane_ns, lane_s = _times(motion, LANES_HZ, options.start_ns)
     lanes = lane_looks(
         route, options.lane_view, options.lanes, lane_ns, motion.poses(lane_s), motion.way_m(lane_s), streams["lanes"]
     )
-    looks, occluder_m, truth = _looked(route, options, motion, boxes, streams["points"])
+    looks, occluder_m, truth = _looked(route, options, motion, boxes, streams)
     return RoadDrive(
         route=route,
         seed=seed,
@@ -200,7 +203,7 @@ def _view(route: Route, options: RoadDriveOptions) -> CameraView:
 
 
 def _looked(
-    route: Route, options: RoadDriveOptions, motion: RoadMotion, boxes: Boxes, rng: np.random.Generator
+    route: Route, options: RoadDriveOptions, motion: RoadMotion, boxes: Boxes, streams: dict[str, np.random.Generator]
 ) -> tuple[tuple[Detections, ...], NDArray[np.float32], DriveTruth]:
     """The looks for point features, what was in the way at each, and the truth of the drive."""
     view, features = _view(route, options), route.features
@@ -211,11 +214,18 @@ def _looked(
     out_of_sight = hidden(poses, features.xy_m, features.height_m, in_view, placed, view.eye_m)
     rows = features.rows("normal", "new")
     standing = (places[0][:, rows], places[1][:, rows])
-    visible = (in_view & ~out_of_sight)[:, rows]
-    looks, of = detected(view, options.points, features.take(rows), route.layer, t_ns, standing, visible, rng)
+    visible, hard = (in_view & ~out_of_sight)[:, rows], options.hard
+    occluder_m = occluder_ranges(view, poses, placed)
+    if hard is None:
+        there = features.take(rows)
+        looks, of = detected(view, options.points, there, route.layer, t_ns, standing, visible, streams["points"])
+    else:
+        signs = (rows, *standing, visible)
+        looks, of = hard_looks(route, view, options.points, hard, t_ns, poses, placed, signs, streams["hard"])
+        occluder_m = erring_profile(occluder_m, view, hard, streams["profile"])
     motion_ns, motion_s = _times(motion, MOTION_HZ, options.start_ns)
     truth = DriveTruth(motion_ns, motion.poses(motion_s), poses, of, in_view, out_of_sight)
-    return looks, occluder_ranges(view, poses, placed), truth
+    return looks, occluder_m, truth
 
 
 def _driven(

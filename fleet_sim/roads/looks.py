@@ -99,7 +99,7 @@ def detected(
         mine = (range_m[row, seen], bearing[row, seen])
         columns = [np.concatenate(pair)[order] for pair in zip(mine, extra[:2], strict=True)]
         kinds = np.concatenate([kind[row, seen], extra[2]])[order].tolist()
-        looks.append(_look(int(t_ns[row]), view, layer, [words[k] for k in kinds], columns, noise))
+        looks.append(look_from(int(t_ns[row]), view, layer, [words[k] for k in kinds], columns, noise))
         truth.append(np.concatenate([features.feature_id[seen], np.zeros(len(extra[0]), dtype=np.int64)])[order])
     return tuple(looks), tuple(truth)
 
@@ -112,9 +112,10 @@ def _false_alarms(
     return range_m, view.width_rad * (rng.random(count) - 0.5), rng.integers(0, words, count)
 
 
-def _look(
+def look_from(
     t_ns: int, view: CameraView, layer: str, kinds: list[str], polar: list[FloatArray], noise: DetectorNoise
 ) -> Detections:
+    """Return a look with detections of these kinds at ranges [m] and bearings [rad], with the noise's sigmas."""
     count = len(kinds)
     return Detections(
         t_ns=t_ns,

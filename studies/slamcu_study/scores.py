@@ -147,7 +147,7 @@ def summary_of(options: Any, outcomes: Sequence[SlamcuSeed], spent_s: Mapping[st
         "step_ms_mean": PAPER_STEP_MS,
     }
     found = {
-        "slamcu": mean,
+        "slamcu": mean | distribution_of(seeds),
         **worst_of(seeds),
         "std_over_seeds": std_over(list(seeds.values())),
         "targets": judged(mean, TARGETS),
@@ -255,6 +255,26 @@ def worst_of(seeds: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
+def distribution_of(seeds: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return how the first drives of all seeds are distributed by the share of signs that are right (per cent), false
+    new signs a drive over all drives, and how many first drives were lost without saying so.
+    """
+    right = np.array([one["accuracy"]["overall"] for one in seeds.values()])
+    return {
+        "distribution": {
+            "mean": float(right.mean()),
+            "median": float(np.median(right)),
+            "p5": float(np.quantile(right, 0.05)),
+            "worst": float(right.min()),
+            "drives": len(right),
+        },
+        "false_new_per_drive": float(
+            np.mean([one["all_drives"]["position_error_m"]["false_a_drive"] for one in seeds.values()])
+        ),
+        "lost_unnoticed": sum(one["lost_without_knowing"] > 0 for one in seeds.values()),
+    }
+
+
 def _of_all(scores: Sequence[SignScore]) -> dict[str, Any]:
     """Return the numbers of all drives together."""
     confusion = np.sum([one.confusion for one in scores], axis=0)
@@ -326,6 +346,9 @@ def _positions(found: Found, ours: Found) -> Sheet:
 
 def _facts(found: Found, ours: Found) -> Sheet:
     table = sheet("beside", "", "")
+    spread = "{distribution.mean:.2f} / {distribution.median:.2f} / {distribution.p5:.2f} / {distribution.worst:.2f} %"
+    table.add("right, first drives: mean / median / 5 % / worst", shown(spread, ours))
+    table.add("false new signs a drive", shown("{false_new_per_drive:.2f}", ours))
     table.add("worst first drive", shown("{worst.accuracy:.2f} % (seed {worst.seed})", found))
     table.add("drives that found they had been lost", shown("{lost} of {drives}", found))
     table.add("drives lost without knowing", shown("{lost_without_knowing} of {drives}", found))

@@ -7,6 +7,7 @@ from typing import Final
 
 from gnd.fleet_sim.drives import EPOCH_NS
 from gnd.fleet_sim.roads.drive import RoadDriveOptions, drive_route
+from gnd.fleet_sim.roads.hard_noise import HardNoise
 from gnd.fleet_sim.roads.motorway import motorway
 from studies.feature_study.pipelines import read_reports, write_reports
 from studies.frame.command import Bench, StudyReport, study
@@ -24,6 +25,7 @@ SOURCES: Final = (
     *(f"studies/slamcu_study/{name}.py" for name in ("driving", "faults", "signs")),
 )
 """What a drive's result depends on."""
+NOISES: Final = ("hard", "kind")
 _HOUR_NS: Final = 3_600 * 1_000_000_000
 
 
@@ -35,6 +37,12 @@ class SlamcuOptions:
     drives: int = option(10, "Vehicles whose reports are merged.", span=(1, 100))
     km: float = option(20.0, "Length of the motorway; signs in proportion.", span=(5, 100))
     ablations: bool = option(True, "The first drive in all variants.")
+    noise: str = option(
+        "hard",
+        "hard: errors that stay with each sign and each drive, confused kinds, look-alikes, an occlusion profile that"
+        " errs; kind: the paper's white noise of known sigma.",
+        known=NOISES,
+    )
     faults: tuple[str, ...] = option(
         (),
         f"What the vehicle knows nothing of, put into every drive: {', '.join(FAULTS)}.",
@@ -77,6 +85,7 @@ class DriveTask:
         seed, km: of the route.
         vehicle: 1, 2, 3 …; its drive has its own noise, traffic and speed.
         variant: of `VARIANTS`.
+        noise: of `NOISES`.
         faults: of `FAULTS`.
         home: folder of results.
     """
@@ -85,6 +94,7 @@ class DriveTask:
     km: float
     vehicle: int
     variant: str
+    noise: str
     faults: tuple[str, ...]
     home: Path
 
@@ -100,8 +110,9 @@ class DriveTask:
 
     def _kept(self, what: str) -> Kept:
         decides = {"seed": self.seed, "km": self.km, "vehicle": self.vehicle, "variant": self.variant}
+        decides |= {"noise": self.noise}
         key = key_of(sources=sources_sha(SOURCES), faults=",".join(self.faults), **decides)
-        return Kept(self.home, "-".join([what, str(self.vehicle), self.variant, *self.faults]), key)
+        return Kept(self.home, "-".join([what, str(self.vehicle), self.variant, self.noise, *self.faults]), key)
 
     @property
     def done(self) -> bool:
@@ -118,14 +129,15 @@ def tasks_of(options: SlamcuOptions, seed: int, root: Path) -> list[DriveTask]:
     """Return the drives of a route: all vehicles, then the first once more in each variant."""
     vehicles = [(vehicle, FULL) for vehicle in range(1, options.drives + 1)]
     variants = [(1, variant) for variant in VARIANTS if variant != FULL and options.ablations]
-    bare = DriveTask(seed, options.km, 0, FULL, options.faults, root / f"seed-{seed}")
+    bare = DriveTask(seed, options.km, 0, FULL, options.noise, options.faults, root / f"seed-{seed}")
     return [replace(bare, vehicle=vehicle, variant=variant) for vehicle, variant in [*vehicles, *variants]]
 
 
 def run_drive(task: DriveTask, tick: Tick) -> None:
     """Drive, classify, report; runs in a worker process."""
     route = motorway(task.seed, 1e3 * task.km)
-    drive = drive_route(route, task.vehicle, RoadDriveOptions(start_ns=EPOCH_NS + task.vehicle * _HOUR_NS))
+    hard = HardNoise() if task.noise == "hard" else None
+    drive = drive_route(route, task.vehicle, RoadDriveOptions(hard=hard, start_ns=EPOCH_NS + task.vehicle * _HOUR_NS))
     drive = with_faults(drive, task.faults, task.seed)
     driven = driven_by(drive, task.variant, task.vehicle, tick)
     write_reports(driven.reports, task.reports)

@@ -127,7 +127,7 @@ def test_more_vehicles_more_accurate():
 @pytest.mark.parametrize(("vehicles", "repeats"), [(24, 1), (12, 4)])
 def test_covariances_stay_honest_over_windows(vehicles, repeats):
     """The same, in windows of four reports, of vehicles that come by again when eight others have been there."""
-    squares = []
+    squares, wide = [], []
     for seed in range(RUNS):
         rng = np.random.default_rng([13, seed])
         truth = rng.uniform(-8, 8, 2)
@@ -147,6 +147,9 @@ def test_covariances_stay_honest_over_windows(vehicles, repeats):
         error = got.points_m[0, :2] - truth
         squares.append(error @ np.linalg.solve(full_covariance(got.cov_m2)[:2, :2], error))
         assert vehicles - 1 <= got.vehicles <= vehicles
-        assert got.cov_m2[0] < 1.2 * 0.09 * (1 + 0.5 * (repeats - 1)) / repeats / vehicles
+        wide.append(got.cov_m2[0] / (0.09 * (1 + 0.5 * (repeats - 1)) / repeats / vehicles))
+    # no vehicle is forgotten; drives that happen to scatter by more than they claim make it a little less sure
+    assert np.mean(wide) < 1.2
+    assert max(wide) < 2.5
     low, high = band(RUNS, 2)
     assert low < np.mean(squares) < high

@@ -1,7 +1,7 @@
 """A straight road along x with signs beside it: a drive whose truth is known, and what its camera says."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, hypot, radians
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu import noise
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.view import CAMERA, Occlusion
 
@@ -76,13 +77,19 @@ def driven(
     hidden: Sequence[int] = (),
     occlusion: Occlusion | None = None,
     given: bool = False,
+    sensor: SensorModel | None = None,
+    yaw_rad: float = 0.0,
+    share: float = 0.0,
 ) -> Slamcu:
-    """A drive along the road: by the filter's own poses from an uncertain start, or by given ones."""
+    """A drive along the road: by the filter's own poses from an uncertain start, or by given ones.
+
+    The camera is mounted `yaw_rad` off, and its ranges are too long by a `share` of them.
+    """
     rng = np.random.default_rng([seed, 77])
     cov0 = np.diag([sigma_m**2, sigma_m**2, radians(sigma_deg) ** 2])
     start = np.array([road.start_m, 0.0, 0.0])
     off = np.zeros(3) if given else np.linalg.cholesky(cov0 + 1e-18 * np.eye(3)) @ rng.standard_normal(3)
-    slamcu = Slamcu(parameters, road.known(), start + off, cov0, seed)
+    slamcu = Slamcu(parameters, road.known(), start + off, cov0, seed, sensor=sensor)
     scale, bias = noise.SCALE * rng.standard_normal(), noise.BIAS_RADPS * rng.standard_normal()
     for i, pose in road.poses():
         if given:
@@ -91,6 +98,8 @@ def driven(
             way, turn = np.sqrt(PERIOD_S) * np.array([noise.SPEED_M, noise.YAW_RAD]) * rng.standard_normal(2)
             speed = (road.speed_mps + way / PERIOD_S) / (1.0 + scale)
             slamcu.predict(PERIOD_S, speed, bias + turn / PERIOD_S)
-        slamcu.look(road.look(i, pose, rng, hidden=hidden), CAMERA, occlusion)
+        look = road.look(i, pose, rng, hidden=hidden)
+        wrong = replace(look, range_m=look.range_m * (1.0 + share), bearing_rad=look.bearing_rad + yaw_rad)
+        slamcu.look(wrong, CAMERA, occlusion)
     slamcu.decide()
     return slamcu

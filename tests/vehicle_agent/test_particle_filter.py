@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from particle_filter_plain import ekf, h, log_normal, unpacked
+from particle_filter_plain import ekf, full, h, log_normal, measured, unpacked
 
 from gnd.vehicle_agent.features.errors import SlamcuParameterError
 from gnd.vehicle_agent.features.slamcu import measurement, noise, particle_filter
@@ -42,27 +42,39 @@ def covariances(rng: np.random.Generator, m: int) -> np.ndarray:
     return full[:, [0, 0, 1], [0, 1, 1]]
 
 
+def features_of(rng: np.random.Generator, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses (3, M), features (M, 4) some way ahead of them, and covariances (M, 10)."""
+    pose = np.stack([rng.normal(0, 5, m), rng.normal(0, 5, m), rng.uniform(-3.2, 3.2, m)])
+    angle, range_m = pose[2] + rng.uniform(-0.3, 0.3, m), rng.uniform(8.0, 60.0, m)
+    place = pose[:2].T + range_m[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    root = rng.normal(0.0, 1.0, (m, 4, 4)) * np.array([1.0, 1.0, 0.05, 0.02])[:, None]
+    whole = root @ root.swapaxes(1, 2) + np.diag([0.1, 0.1, 1e-4, 1e-5])
+    rows, columns = np.array(measurement.PACKED).T
+    return pose, np.hstack([place, rng.normal(0.0, [0.05, 0.02], (m, 2))]), whole[:, rows, columns]
+
+
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
 def test_update_of_all_particles_is_the_textbook_update_of_each(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    m = 7
-    pose = np.stack([rng.normal(0, 5, m), rng.normal(0, 5, m), rng.uniform(-3.2, 3.2, m)])
-    mu = pose[:2].T + rng.uniform(8.0, 60.0, (m, 1)) * np.stack([np.cos(seed + pose[2]), np.sin(seed + pose[2])], 1)
-    sigma = covariances(rng, m)
-    z = h(pose[:, 0], mu[0]) + rng.normal(0.0, 1.0, 2) * np.sqrt(VARIANCE)
-    new_mu, new_sigma, log_likelihood = measurement.update(pose, mu, sigma, z, VARIANCE)
+    rng, m = np.random.default_rng(seed), 7
+    pose, mean, cov = features_of(rng, m)
+    camera = rng.normal(0.0, [[0.03], [0.02]], (2, m))
+    z = measured(pose[:, 0], mean[0], camera[:, 0]) + rng.normal(0.0, 1.0, 2) * np.sqrt(VARIANCE)
+    new_mean, new_cov, log_likelihood = measurement.update(pose, mean, cov, z, VARIANCE, camera)
     for k in range(m):
-        want = ekf(pose[:, k], mu[k], unpacked(sigma[k]), z, np.diag(VARIANCE))
-        assert np.allclose(new_mu[k], want[0], atol=1e-5)
-        assert np.allclose(unpacked(new_sigma[k]), want[1], atol=1e-5)
+        want = ekf(pose[:, k], mean[k], full(cov[k]), z, np.diag(VARIANCE), camera[:, k])
+        assert np.allclose(new_mean[k], want[0], atol=1e-5)
+        assert np.allclose(full(new_cov[k]), want[1], atol=1e-5)
         assert np.isclose(log_likelihood[k], want[2], rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.usefixtures("no_floor", "no_resampling")
-def test_a_whole_sequence_agrees_with_a_loop_over_particles() -> None:
+@pytest.mark.parametrize("held", [(0.0, 0.0), (0.05**2, radians(1.0) ** 2)])
+def test_a_whole_sequence_agrees_with_a_loop_over_particles(held: tuple[float, float]) -> None:
     """Weights, positions and covariances after three measurements, of a filter that may not resample."""
     particles = particles_of(40)
+    particles.held = np.array(held)
+    particles.calibrate(np.array([0.02, radians(0.5)]))
     truth, rng = np.array([-20.0, 6.0]), np.random.default_rng(3)
     poses = particles.state[:3].copy()
     plain: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -70,24 +82,29 @@ def test_a_whole_sequence_agrees_with_a_loop_over_particles() -> None:
         z = h(np.array([10.0, -4.0, 2.9]), truth) + rng.normal(0.0, 1.0, 2) * np.sqrt(VARIANCE)
         if step == 0:
             particles.add(z, VARIANCE)
-            plain = [(particles.mu[0, k].copy(), unpacked(particles.sigma[0, k]), 0.0) for k in range(40)]
+            plain = [(particles.mean[0, k].copy(), full(particles.cov[0, k]), 0.0) for k in range(40)]
             continue
         particles.measure(0, z, VARIANCE, weigh=True)
-        after = [ekf(poses[:, k], mu, sigma, z, np.diag(VARIANCE)) for k, (mu, sigma, _) in enumerate(plain)]
+        ways = [(*one[:2], z, np.diag(VARIANCE), particles.camera[:, k]) for k, one in enumerate(plain)]
+        after = [ekf(poses[:, k], *way) for k, way in enumerate(ways)]
         plain = [(*new[:2], old[2] + new[2]) for new, old in zip(after, plain, strict=True)]
-    assert np.allclose(particles.mu[0], [one[0] for one in plain], atol=1e-4)
-    assert np.allclose([unpacked(row) for row in particles.sigma[0]], [one[1] for one in plain], atol=1e-4)
+    assert np.allclose(particles.mean[0], [one[0] for one in plain], atol=1e-4)
+    assert np.allclose([full(row) for row in particles.cov[0]], [one[1] for one in plain], atol=1e-4)
     assert np.allclose(particles.log_weight, [one[2] for one in plain], atol=1e-3)
 
 
-def test_the_first_measurement_places_a_feature() -> None:
-    particles = particles_of(5)
-    z = np.array([30.0, 0.2])
+@pytest.mark.parametrize("held", [(0.0, 0.0), (0.05**2, radians(1.0) ** 2)])
+def test_the_first_measurement_places_a_feature(held: tuple[float, float]) -> None:
+    particles, none = particles_of(5), np.zeros(2)
+    z, particles.held = np.array([30.0, 0.2]), np.array(held)
+    particles.calibrate(np.array([0.02, radians(0.5)]))
     particles.add(z, VARIANCE)
     for k in range(5):
-        assert np.allclose(h(particles.state[:3, k], particles.mu[0, k]), z)
-        want = ekf(particles.state[:3, k], particles.mu[0, k], 1e9 * np.eye(2), z, np.diag(VARIANCE))
-        assert np.allclose(unpacked(particles.sigma[0, k]), want[1], rtol=1e-3)
+        pose, camera = particles.state[:3, k], particles.camera[:, k]
+        assert np.allclose(measured(pose, particles.mean[0, k], camera), z)
+        before = np.diag([1e9, 1e9, *held])
+        want = ekf(pose, np.array([*particles.mu[0, k], *none]), before, z, np.diag(VARIANCE), camera)
+        assert np.allclose(full(particles.cov[0, k]), want[1], rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.usefixtures("no_floor", "no_resampling")
@@ -115,15 +132,18 @@ def test_settling_is_weighing_with_eq_17_when_the_map_has_no_error() -> None:
 
 def test_fusing_is_adding_information() -> None:
     rng = np.random.default_rng(5)
-    mu, sigma, at, cov = rng.normal(0, 3, (6, 2)), covariances(rng, 6), rng.normal(0, 3, 2), covariances(rng, 1)[0]
-    got_mu, got_sigma = measurement.fused(mu, sigma, at, cov)
-    log = measurement.agreement(mu, sigma, at, cov)
+    (_, mean, cov), at, other = features_of(rng, 6), rng.normal(0, 3, 2), covariances(rng, 1)[0]
+    got_mean, got_cov = measurement.fused(mean, cov, at, other)
+    log = measurement.agreement(mean[:, :2], cov[:, :3], at, other)
     for k in range(6):
-        one, other = np.linalg.inv(unpacked(sigma[k])), np.linalg.inv(unpacked(cov))
-        both = np.linalg.inv(one + other)
-        assert np.allclose(unpacked(got_sigma[k]), both)
-        assert np.allclose(got_mu[k], both @ (one @ mu[k] + other @ at))
-        assert np.isclose(log[k], log_normal(mu[k] - at, unpacked(sigma[k]) + unpacked(cov)))
+        told = np.zeros((4, 4))
+        told[:2, :2] = np.linalg.inv(unpacked(other))
+        both = np.linalg.inv(np.linalg.inv(full(cov[k])) + told)
+        assert np.allclose(full(got_cov[k]), both, atol=1e-6)
+        assert np.allclose(
+            got_mean[k], both @ (np.linalg.inv(full(cov[k])) @ mean[k] + told @ [*at, 0.0, 0.0]), atol=1e-6
+        )
+        assert np.isclose(log[k], log_normal(mean[k, :2] - at, full(cov[k])[:2, :2] + unpacked(other)))
 
 
 def test_moments_are_those_of_the_mixture() -> None:

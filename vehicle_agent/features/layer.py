@@ -17,6 +17,7 @@ from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
 from gnd.vehicle_agent.features.layer_parameters import slamcu_of, view_of
 from gnd.vehicle_agent.features.look import Look, MapFeatures
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
@@ -63,7 +64,10 @@ class FeatureLayer:
         slamcu: Slamcu | WatchedSlamcu | None = None,
     ) -> None:
         self.parameters, self._frame, self._view = parameters, frame, view_of(parameters)
-        self._slamcu = slamcu or Slamcu(slamcu_of(parameters), MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
+        sensor = SensorModel(parameters.detection_confidence, learns=parameters.sensor == "camera")
+        self._slamcu = slamcu or Slamcu(
+            slamcu_of(parameters), MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4, sensor=sensor
+        )
         self._coverage = Coverage(frame, self._view, parameters.height_m)
         self._held: dict[TileId, FeatureTile] = {}
         self._ids: dict[TileId, tuple[int, ...]] = {}
@@ -223,7 +227,7 @@ def taken(look: Look, rows: I64, kinds: Sequence[str]) -> Look:
     return Look(look.t_ns, range_m, bearing_rad, sigma_range_m, sigma_bearing_rad, tuple(kinds), height_m)
 
 
-def of_counts(hits: int, misses: int, confidence: float) -> Existence:
+def of_counts(hits: int, misses: float, confidence: float) -> Existence:
     """Masses of so many detections and misses, begun vacuous: this drive's own evidence. SLAMCU, Eq. (1), (2), (5).
 
     Combined in closed form: with u = (1 - λ)^n of either kind, m(∃) ∝ (1 - u_hit) u_miss, m(∄) ∝ (1 - u_miss) u_hit,

@@ -13,6 +13,7 @@ from studies.slamcu_study.figures import most_telling, outliers
 from studies.slamcu_study.scores import (
     UNCLASSIFIED,
     accuracy_of,
+    distribution_of,
     drive_summary,
     lost_without_knowing,
     merged_score,
@@ -176,6 +177,21 @@ def test_the_worst_drive_and_the_lost_ones_are_told() -> None:
     }
     told = worst_of(seeds)
     assert told == {"worst": {"accuracy": 60.0, "seed": 8}, "lost": 1, "lost_without_knowing": 1, "drives": 2}
+
+
+def test_the_distribution_is_that_of_the_first_drives() -> None:
+    seeds = {
+        str(n): {
+            "accuracy": {"overall": 100.0 - n},
+            "all_drives": {"position_error_m": {"false_a_drive": 0.5 * n}},
+            "lost_without_knowing": int(n == 20) * 3,
+        }
+        for n in range(21)
+    }
+    found = distribution_of(seeds)
+    assert found["distribution"] == {"mean": 90.0, "median": 90.0, "p5": 81.0, "worst": 80.0, "drives": 21}
+    assert found["false_new_per_drive"] == 5.0
+    assert found["lost_unnoticed"] == 1
 
 
 def test_seeds_are_numbers_and_ranges() -> None:

@@ -21,6 +21,7 @@ from gnd.vehicle_agent.features.layers import look_of
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, MapFeatures
 from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, first_pose_of
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
 from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.features.without_lidar import VehicleWithoutLidar
@@ -164,7 +165,9 @@ class CameraPipeline(VehicleWithoutLidar):
             return  # it goes on: a vehicle that stands will start
         layer = self._layer_parameters
         parameters = SlamcuParameters(detection_confidence=layer.detection_confidence)
-        self.slamcu = WatchedSlamcu(parameters, MapFeatures.none(), first.pose, first.cov, self._seed, sigma_m)
+        sensor = SensorModel(layer.detection_confidence)
+        none = MapFeatures.none()
+        self.slamcu = WatchedSlamcu(parameters, none, first.pose, first.cov, self._seed, sigma_m, sensor)
         self._layer = FeatureLayer(layer, self.place.frame, self.slamcu)
         self._motion_ns = first.t_ns
         self._before.clear()
@@ -198,8 +201,8 @@ class CameraPipeline(VehicleWithoutLidar):
         self._looks.append(_Taken(item.t_ns, slamcu.odometer_m, occlusion))
         self.counts["looks"] += 1
         pose, cov = slamcu.pose()
-        health: Health = "lost" if slamcu.is_lost else "good"
-        cause: Cause = "wrong_pose" if slamcu.is_lost else "none"
+        health: Health = "lost" if slamcu.is_lost else "degraded" if slamcu.camera_is_wrong else "good"
+        cause: Cause = "wrong_pose" if slamcu.is_lost else "mount" if slamcu.camera_is_wrong else "none"
         self._online = self._estimate(item.t_ns, pose, cov, health, cause)
 
     def _estimate(self, t_ns: int, pose: F64, cov: F64, health: Health, cause: Cause) -> PoseEstimate:

@@ -7,6 +7,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import HEADING
+from gnd.vehicle_agent.features.slamcu.measurement import PACKED
 from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
 from gnd.vehicle_agent.features.slamcu.tracked_feature import TrackedFeature
 from gnd.vehicle_agent.features.view import wrapped
@@ -39,13 +40,17 @@ def forecast(particles: ParticleFilter, weights: F64, features: Sequence[Tracked
     n = len(features)
     if n == 0:
         return Forecast(np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    places = np.empty((n, 2, particles.m))
-    within = np.empty((n, 3))
+    places, within = np.zeros((n, 4, particles.m)), np.zeros((n, 10))
     for i, feature in enumerate(features):
-        places[i], within[i] = _place(particles, weights, feature)
-    d = places - particles.state[None, :2]
-    range_m = np.hypot(d[:, 0], d[:, 1])
-    bearing = np.arctan2(d[:, 1], d[:, 0]) - particles.state[HEADING]
+        if feature.slot is not None:
+            places[i], within[i] = particles.mean[feature.slot].T, weights @ particles.cov[feature.slot]
+        else:
+            places[i, :2] = feature.xy_m[:, None]
+            within[i, :3] = 0.0 if feature.cov is None else feature.cov
+            within[i, [7, 9]] = particles.held
+    d = places[:, :2] - particles.state[None, :2]
+    range_m = np.hypot(d[:, 0], d[:, 1]) * (1.0 + particles.camera[0] + places[:, 2])
+    bearing = np.arctan2(d[:, 1], d[:, 0]) - particles.state[HEADING] + particles.camera[1] + places[:, 3]
     z = np.stack([range_m, bearing[:, :1] + wrapped(bearing - bearing[:, :1])])
     mean = z @ weights
     off = z - mean[..., None]
@@ -53,17 +58,15 @@ def forecast(particles: ParticleFilter, weights: F64, features: Sequence[Tracked
     return Forecast(np.stack([mean[0], wrapped(mean[1])], axis=1), cov)
 
 
-def _place(particles: ParticleFilter, weights: F64, feature: TrackedFeature) -> tuple[F64, F64]:
-    """Positions (2, M) or (2, 1), and the covariance (3,) within each particle."""
-    if feature.slot is not None:
-        return particles.mu[feature.slot].T, weights @ particles.sigma[feature.slot]
-    return feature.xy_m[:, None], np.zeros(3) if feature.cov is None else feature.cov
-
-
 def _projected(d: F64, within: F64) -> F64:
-    """H Σ Hᵀ (n, 2, 2) of features at d (n, 2) from the vehicle with covariances (n, 3)."""
+    """H Σ Hᵀ (n, 2, 2) of features at d (n, 2) from the vehicle with covariances (n, 10), `measurement.PACKED`."""
     range_m = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-3)
-    cos, sin = d[:, 0] / range_m, d[:, 1] / range_m
-    h = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1) / range_m[:, None]], axis=1)
-    sigma = within[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    cos, sin, none = d[:, 0] / range_m, d[:, 1] / range_m, np.zeros(len(d))
+    h = np.stack(
+        [np.stack([cos, sin, range_m, none], -1), np.stack([-sin / range_m, cos / range_m, none, none + 1.0], -1)],
+        axis=1,
+    )
+    sigma = np.empty((len(d), 4, 4))
+    for k, (i, j) in enumerate(PACKED):
+        sigma[:, i, j] = sigma[:, j, i] = within[:, k]
     return np.asarray(h @ sigma @ h.transpose(0, 2, 1))

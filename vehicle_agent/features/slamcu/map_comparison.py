@@ -19,6 +19,7 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import BlindFilter
 from gnd.vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED, NONE, best_identities
+from gnd.vehicle_agent.features.slamcu.sensor_model import OTHER_KIND
 from gnd.vehicle_agent.features.slamcu.track_list import TrackList
 from gnd.vehicle_agent.features.slamcu.tracked_feature import TrackedFeature
 
@@ -32,6 +33,8 @@ ENOUGH_HITS: Final = 6
 """So many measurements show where a feature is, and whether it is ever measured together with another."""
 GROUP_M: Final = 12.0
 """Features within this distance may be taken for each other: three lanes."""
+WIDE_GROUP_M: Final = 20.0
+"""The same where errors stay with features: along the road they may be many metres."""
 RIVAL_SHARE: Final = 0.25
 """What was measured less often than this share of what stands beside it is no feature of the map that was in view."""
 SURE: Final = 3.0
@@ -130,6 +133,9 @@ class MapComparison:
             return
         xy_m, cov = self._tracks.moments(feature)
         moved = self._is_elsewhere(feature, xy_m, cov)
+        if feature.known and self._is_of_another_kind(feature):
+            self._split(feature, t_ns)
+            return
         if not feature.known:  # found on an earlier passage already
             if moved:
                 self._particles.priors[feature.slot] = None
@@ -137,7 +143,7 @@ class MapComparison:
                 self._particles.settle(feature.slot)
             feature.cov = None
             return
-        self.innovations.append(innovation_of(feature, xy_m, cov))
+        self.innovations.append(innovation_of(feature, xy_m, cov * self._tracks.sensor.places))
         if moved and self._is_the_vehicle(feature, xy_m - feature.xy_m):
             self._search_anew(t_ns)  # and settle when the place has been found
         elif moved:
@@ -146,17 +152,37 @@ class MapComparison:
         else:
             self._last_moved, self._in_place_m = None, feature.odometer_m
             before = feature.measured
+            if self._tracks.sensor.learns:
+                self._tracks.sensor.compared(innovation_of(feature, xy_m, cov).squared)
             feature.measured = (xy_m, cov) if before is None else fused_moments(before, (xy_m, cov))
         self._particles.settle(feature.slot)
+        self._learn(feature)
+
+    def _learn(self, feature: TrackedFeature) -> None:
+        """What a feature that was found in place says about errors that stay with features."""
+        if self._tracks.sensor.learns and feature.slot is not None and feature.pass_hits >= ENOUGH_HITS:
+            errors = self._particles.errors_of(feature.slot, self._particles.weights())
+            self._tracks.sensor.settled(*errors, feature.held)
 
     def _is_elsewhere(self, feature: TrackedFeature, xy_m: F64, cov: F64) -> bool:
-        far = float(np.hypot(*(xy_m - feature.xy_m))) > MOVED_M
-        return far and innovation_of(feature, xy_m, cov).squared > MOVED_GATE
+        sensor, far = self._tracks.sensor, float(np.hypot(*(xy_m - feature.xy_m))) > MOVED_M
+        if not far or not sensor.learns:
+            return far and innovation_of(feature, xy_m, cov).squared > MOVED_GATE
+        pose, _ = self._particles.pose(self._particles.weights())
+        wide = cov * sensor.places + sensor.lasting(float(pose[2]))
+        return innovation_of(feature, xy_m, wide).squared > MOVED_GATE
+
+    def _is_of_another_kind(self, feature: TrackedFeature) -> bool:
+        """Whether nearly all of its detections name a kind that the map does not."""
+        total = sum(feature.named.values())
+        kind, most = feature.named.most_common(1)[0] if total else (feature.kind, 0)
+        return kind != feature.kind and total >= ENOUGH_HITS and most >= OTHER_KIND * total
 
     def _split(self, feature: TrackedFeature, t_ns: int) -> None:
         """A moved feature is a deleted one and a new one (section 2.3)."""
         xy_m, _ = self._tracks.moments(feature)
-        found, hits = self._tracks.register(feature.kind), feature.pass_hits
+        kind = feature.named.most_common(1)[0][0] if feature.named else feature.kind
+        found, hits = self._tracks.register(kind), feature.pass_hits
         found.xy_m, found.in_view_s, found.odometer_m = xy_m, feature.in_view_s, feature.odometer_m
         found.heights, feature.heights = feature.heights, found.heights
         self._tracks.hand_over(feature, found)
@@ -194,11 +220,12 @@ class MapComparison:
     def _group(self, feature: TrackedFeature) -> list[TrackedFeature]:
         """Features like this one around it that are being estimated, those of the map that await comparison first."""
         here = self._particles.mu[feature.estimated_in].mean(axis=0)
+        reach_m = WIDE_GROUP_M if self._tracks.sensor.learns else GROUP_M
         alike = [
             one
             for one in self._tracks.live
             if one.kind == feature.kind
-            and float(np.hypot(*(self._particles.mu[one.estimated_in].mean(axis=0) - here))) < GROUP_M
+            and float(np.hypot(*(self._particles.mu[one.estimated_in].mean(axis=0) - here))) < reach_m
         ]
         unsettled = [one for one in alike if one.known and self._tracks.awaits_map(one)]
         most = max(one.pass_hits for one in alike)

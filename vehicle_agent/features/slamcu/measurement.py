@@ -4,12 +4,16 @@ A pose is (x, y, heading) of the vehicle in the map frame; particles lie along t
 the first of features, (M, 2). Covariances of features are kept as xx, xy, yy.
 """
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.view import wrapped
+
+PACKED: Final = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 2), (2, 3), (3, 3))
+"""Rows and columns of the ten numbers that a symmetric covariance (4, 4) of x, y, share of range, bearing is kept as:
+the first three are those of the position."""
 
 
 class Predicted(NamedTuple):
@@ -34,65 +38,102 @@ def predicted(pose: F64, mu: F64) -> Predicted:
     return Predicted(range_m, wrapped(np.arctan2(dy, dx) - pose[2]), dx / range_m, dy / range_m)
 
 
-def inverse(pose: F64, z: F64, variance: F64) -> tuple[F64, F64]:
+def inverse(pose: F64, z: F64, variance: F64, camera: F64, held: F64) -> tuple[F64, F64]:
     """The feature that each particle measures, were it the first time.
 
     Args:
         pose: (3, M).
         z: (2,) range [m] and bearing [rad].
         variance: (2,) of z.
+        camera: (2, M), errors of the camera: share of the range, and bearing [rad].
+        held: (2,) variances of the same errors that stay with this feature.
 
     Returns:
-        (M, 2) positions and (M, 3) covariances xx, xy, yy.
+        (M, 4) x, y [m] and the errors of range (share) and bearing [rad]; (M, 10) covariances, see `PACKED`.
     """
-    direction = pose[2] + z[1]
+    scale = 1.0 + camera[0]
+    range_m, direction = z[0] / scale, pose[2] + z[1] - camera[1]
     cos, sin = np.cos(direction), np.sin(direction)
-    along, across = variance[0], variance[1] * z[0] ** 2
-    mu = np.stack([pose[0] + z[0] * cos, pose[1] + z[0] * sin], axis=1)
+    share, turn = range_m * held[0] / scale, np.full_like(cos, held[1])
+    along, across = (variance[0] / scale + range_m * share) / scale, (variance[1] + turn) * range_m**2
+    none = np.zeros_like(cos)
+    mean = np.stack([pose[0] + range_m * cos, pose[1] + range_m * sin, none, none], axis=1)
     xx, xy, yy = cos**2 * along + sin**2 * across, cos * sin * (along - across), sin**2 * along + cos**2 * across
-    return mu, np.stack([xx, xy, yy], axis=1)
+    turned = range_m * turn
+    cross = (-share * cos, -share * sin, turned * sin, -turned * cos)
+    return mean, np.stack([xx, xy, yy, *cross, none + held[0], none, turn], axis=1)
 
 
-def innovation_cov(at: Predicted, sigma: F64, variance: F64) -> tuple[F64, F64, F64]:
-    """Q = H Σ Hᵀ + R of Eq. (18), as rr, rb, bb; (M,) each."""
-    xx, xy, yy = sigma[..., 0], sigma[..., 1], sigma[..., 2]
-    rr = at.cos**2 * xx + 2.0 * at.cos * at.sin * xy + at.sin**2 * yy
-    rb = (at.cos * at.sin * (yy - xx) + (at.cos**2 - at.sin**2) * xy) / at.range_m
-    bb = (at.sin**2 * xx - 2.0 * at.cos * at.sin * xy + at.cos**2 * yy) / at.range_m**2
-    return rr + variance[0], rb, bb + variance[1]
+class Innovation(NamedTuple):
+    """A measurement against what each particle predicts; all (M,)."""
+
+    nu_r: F64
+    nu_b: F64
+    rr: F64
+    rb: F64
+    bb: F64
+    """Q = H Σ Hᵀ + R of Eq. (18)."""
+    r: tuple[F64, F64, F64, F64]
+    b: tuple[F64, F64, F64, F64]
+    """Columns of Σ Hᵀ."""
+
+    @property
+    def log_likelihood(self) -> F64:
+        """Eq. (18), with the factor -1/2 that its exponent lacks. With Σ = 0 it is Eq. (17)."""
+        det = self.rr * self.bb - self.rb**2
+        squared = (self.bb * self.nu_r**2 - 2.0 * self.rb * self.nu_r * self.nu_b + self.rr * self.nu_b**2) / det
+        return np.asarray(-0.5 * squared - 0.5 * np.log((2.0 * np.pi) ** 2 * det))
 
 
-def update(pose: F64, mu: F64, sigma: F64, z: F64, variance: F64) -> tuple[F64, F64, F64]:
+def innovation(pose: F64, mean: F64, cov: F64, z: F64, variance: F64, camera: F64) -> Innovation:
+    """How a measurement differs from what is predicted; arguments as of `update`."""
+    at = predicted(pose, mean)
+    scale = 1.0 + camera[0] + mean[:, 2]
+    gx, gy = at.cos * scale, at.sin * scale  # ∂range/∂(x, y); ∂range/∂share = range, ∂bearing/∂turn = 1
+    tx, ty = -at.sin / at.range_m, at.cos / at.range_m
+    xx, xy, yy, xe, ye, xb, yb, ee, eb, bb = cov.T
+    r = (
+        xx * gx + xy * gy + xe * at.range_m,
+        xy * gx + yy * gy + ye * at.range_m,
+        xe * gx + ye * gy + ee * at.range_m,
+        xb * gx + yb * gy + eb * at.range_m,
+    )
+    b = (xx * tx + xy * ty + xb, xy * tx + yy * ty + yb, xe * tx + ye * ty + eb, xb * tx + yb * ty + bb)
+    return Innovation(
+        nu_r=z[0] - at.range_m * scale,
+        nu_b=wrapped(z[1] - at.bearing_rad - camera[1] - mean[:, 3]),
+        rr=gx * r[0] + gy * r[1] + at.range_m * r[2] + variance[0],
+        rb=tx * r[0] + ty * r[1] + r[3],
+        bb=tx * b[0] + ty * b[1] + b[3] + variance[1],
+        r=r,
+        b=b,
+    )
+
+
+def update(pose: F64, mean: F64, cov: F64, z: F64, variance: F64, camera: F64) -> tuple[F64, F64, F64]:
     """EKF update of one feature in every particle, and how likely the measurement was.
 
-    Eq. (16) without the stray inverse at the innovation and with H taken with respect to the feature; Eq. (18) with the
-    factor -1/2 that its exponent lacks. With Σ = 0 the likelihood is Eq. (17).
+    Eq. (16) without the stray inverse at the innovation and with H taken with respect to the feature; beside its
+    position the feature has an error of range and of bearing that all of its measurements share.
 
     Args:
         pose: (3, M).
-        mu: (M, 2).
-        sigma: (M, 3) xx, xy, yy.
+        mean: (M, 4).
+        cov: (M, 10), see `PACKED`.
         z: (2,) range [m] and bearing [rad].
         variance: (2,) of z, the diagonal of R.
+        camera: (2, M), errors of the camera: share of the range, and bearing [rad].
 
     Returns:
-        (M, 2) positions, (M, 3) covariances, (M,) log likelihoods.
+        (M, 4) means, (M, 10) covariances, (M,) log likelihoods.
     """
-    at = predicted(pose, mu)
-    rr, rb, bb = innovation_cov(at, sigma, variance)
-    det = rr * bb - rb * rb
-    nu_r, nu_b = z[0] - at.range_m, wrapped(z[1] - at.bearing_rad)
-    xx, xy, yy = sigma[:, 0], sigma[:, 1], sigma[:, 2]
-    # Σ Hᵀ, its two columns
-    xr, yr = xx * at.cos + xy * at.sin, xy * at.cos + yy * at.sin
-    xb, yb = (xy * at.cos - xx * at.sin) / at.range_m, (yy * at.cos - xy * at.sin) / at.range_m
-    # K = Σ Hᵀ Q⁻¹, Eq. (16)
-    k_xr, k_xb = (xr * bb - xb * rb) / det, (xb * rr - xr * rb) / det
-    k_yr, k_yb = (yr * bb - yb * rb) / det, (yb * rr - yr * rb) / det
-    out_mu = np.stack([mu[:, 0] + k_xr * nu_r + k_xb * nu_b, mu[:, 1] + k_yr * nu_r + k_yb * nu_b], axis=1)
-    out_sigma = np.stack([xx - k_xr * xr - k_xb * xb, xy - k_xr * yr - k_xb * yb, yy - k_yr * yr - k_yb * yb], axis=1)
-    squared = (bb * nu_r**2 - 2.0 * rb * nu_r * nu_b + rr * nu_b**2) / det
-    return out_mu, out_sigma, -0.5 * squared - 0.5 * np.log((2.0 * np.pi) ** 2 * det)  # Eq. (18)
+    one = innovation(pose, mean, cov, z, variance, camera)
+    det = one.rr * one.bb - one.rb**2
+    gain_r = [(r * one.bb - b * one.rb) / det for r, b in zip(one.r, one.b, strict=True)]  # K = Σ Hᵀ Q⁻¹
+    gain_b = [(b * one.rr - r * one.rb) / det for r, b in zip(one.r, one.b, strict=True)]
+    out_mean = np.stack([gain_r[i] * one.nu_r + gain_b[i] * one.nu_b for i in range(4)], axis=1) + mean
+    less = [gain_r[i] * one.r[j] + gain_b[i] * one.b[j] for i, j in PACKED]
+    return out_mean, cov - np.stack(less, axis=1), one.log_likelihood
 
 
 def agreement(mu: F64, sigma: F64, xy_m: F64, cov: F64) -> F64:
@@ -110,14 +151,24 @@ def agreement(mu: F64, sigma: F64, xy_m: F64, cov: F64) -> F64:
     return np.asarray(-0.5 * squared - 0.5 * np.log((2.0 * np.pi) ** 2 * det))
 
 
-def fused(mu: F64, sigma: F64, xy_m: F64, cov: F64) -> tuple[F64, F64]:
-    """Two estimates of one feature made one, in every particle; arguments as of `agreement`."""
-    s = sigma + cov
-    det = s[..., 0] * s[..., 2] - s[..., 1] ** 2
-    a, b, c = s[..., 2] / det, -s[..., 1] / det, s[..., 0] / det  # (Σ + C)⁻¹
-    xx, xy, yy = sigma[:, 0], sigma[:, 1], sigma[:, 2]
-    k = (xx * a + xy * b, xx * b + xy * c, xy * a + yy * b, xy * b + yy * c)
-    d = xy_m - mu
-    out_mu = np.stack([mu[:, 0] + k[0] * d[:, 0] + k[1] * d[:, 1], mu[:, 1] + k[2] * d[:, 0] + k[3] * d[:, 1]], axis=1)
-    out = np.stack([xx - k[0] * xx - k[1] * xy, xy - k[0] * xy - k[1] * yy, yy - k[2] * xy - k[3] * yy], axis=1)
-    return out_mu, out
+def fused(mean: F64, cov: F64, xy_m: F64, other: F64) -> tuple[F64, F64]:
+    """A feature's position known otherwise is taken in, in every particle.
+
+    Args:
+        mean: (M, 4).
+        cov: (M, 10), see `PACKED`.
+        xy_m: (2,) or (M, 2).
+        other: (3,) or (M, 3), covariance of that.
+
+    Returns:
+        (M, 4) means and (M, 10) covariances.
+    """
+    s = cov[:, :3] + other
+    det = s[:, 0] * s[:, 2] - s[:, 1] ** 2
+    a, b, c = s[:, 2] / det, -s[:, 1] / det, s[:, 0] / det  # (Σ + C)⁻¹
+    columns = [(cov[:, 0], cov[:, 1]), (cov[:, 1], cov[:, 2]), (cov[:, 3], cov[:, 4]), (cov[:, 5], cov[:, 6])]
+    gains = [(x * a + y * b, x * b + y * c) for x, y in columns]
+    d = xy_m - mean[:, :2]
+    out_mean = mean + np.stack([gx * d[:, 0] + gy * d[:, 1] for gx, gy in gains], axis=1)
+    less = [gains[i][0] * columns[j][0] + gains[i][1] * columns[j][1] for i, j in PACKED]
+    return out_mean, cov - np.stack(less, axis=1)

@@ -50,8 +50,11 @@ class ParticleFilter:
     Attributes:
         state: (7, M) x, y [m], heading [rad], wheel scale, gyro bias [rad/s], slow GNSS error [m].
         log_weight: (M,), not normalised.
-        mu: (F, M, 2) positions of the features.
-        sigma: (F, M, 3) their covariances xx, xy, yy.
+        camera: (2, M) errors of the camera: share of all ranges, and its bearing [rad]; zero unless `calibrate` was
+            called.
+        mean: (F, M, 4) of the features: position [m], and errors of range (share) and bearing [rad] that stay with it.
+        cov: (F, M, 10) their covariances, `measurement.PACKED`.
+        held: (2,) variances of the errors that stay with a feature, of those that are added.
         priors: F positions known otherwise that are not yet settled, None where there is none.
         provisional: F, whether such a prior weighs the particles already; not where it may be another feature's.
         rng: where chance comes from.
@@ -68,8 +71,9 @@ class ParticleFilter:
             self.state[BIAS] = noise.BIAS_RADPS * rng.standard_normal(m)
         self._gnss_var: float | None = None
         self.log_weight = np.zeros(m)
-        self.mu = np.zeros((0, m, 2))
-        self.sigma = np.zeros((0, m, 3))
+        self.camera, self.held = np.zeros((2, m)), np.zeros(2)
+        self.mean = np.zeros((0, m, 4))
+        self.cov = np.zeros((0, m, 10))
         self.priors: list[Prior | None] = []
         self.provisional: list[bool] = []
         self.weighing = True
@@ -78,6 +82,28 @@ class ParticleFilter:
     def m(self) -> int:
         """Number of particles."""
         return self.state.shape[1]
+
+    @property
+    def mu(self) -> F64:
+        """(F, M, 2) positions of the features."""
+        return self.mean[..., :2]
+
+    @property
+    def sigma(self) -> F64:
+        """(F, M, 3) covariances of these, xx, xy, yy."""
+        return self.cov[..., :3]
+
+    def calibrate(self, sigma: F64) -> None:
+        """Estimate errors of the camera, which are drawn with these sigmas (2,): share of ranges, bearing [rad]."""
+        if self.m > 1:
+            self.camera = sigma[:, None] * self.rng.standard_normal((2, self.m))
+
+    def calibration(self) -> tuple[F64, F64]:
+        """Errors of the camera: mean (2,) and covariance (2, 2) of the share of ranges, and of the bearing [rad]."""
+        weights = self.weights()
+        mean = self.camera @ weights
+        off = self.camera - mean[:, None]
+        return mean, (off * weights) @ off.T
 
     def place(self, pose: F64, cov: F64) -> None:
         """Draw the poses around one; each particle keeps its side of it, as errors of a localiser last."""
@@ -90,6 +116,8 @@ class ParticleFilter:
         if self.m == 1:
             self.place(belief.mean[:3], belief.cov[:3, :3])
             return
+        if self.camera.any():
+            self.camera = self.camera[:, systematic(_normalised(self.log_weight), float(self.rng.random()))]
         self.log_weight = np.zeros(self.m)
         driven = belief.cov[:GNSS_X, :GNSS_X]
         values, vectors = np.linalg.eigh(driven)
@@ -140,14 +168,14 @@ class ParticleFilter:
 
     def add(self, z: F64, variance: F64, prior: Prior | None = None) -> None:
         """A further feature, at the end, where this measurement puts it."""
-        mu, sigma = measurement.inverse(self.state[:3], z, variance)
-        self.mu, self.sigma = np.concatenate([self.mu, mu[None]]), np.concatenate([self.sigma, sigma[None]])
+        mean, cov = measurement.inverse(self.state[:3], z, variance, self.camera, self.held)
+        self.mean, self.cov = np.concatenate([self.mean, mean[None]]), np.concatenate([self.cov, cov[None]])
         self.priors.append(prior)
         self.provisional.append(True)
 
     def remove(self, slot: int) -> None:
         """Forget a feature."""
-        self.mu, self.sigma = np.delete(self.mu, slot, axis=0), np.delete(self.sigma, slot, axis=0)
+        self.mean, self.cov = np.delete(self.mean, slot, axis=0), np.delete(self.cov, slot, axis=0)
         del self.priors[slot], self.provisional[slot]
 
     def measure(self, slot: int, z: F64, variance: F64, *, weigh: bool) -> None:
@@ -155,14 +183,14 @@ class ParticleFilter:
         updated = self._updated(slot, z, variance)
         if weigh and self._weigh(lambda: self._floored(self._updated(slot, z, variance)[2]), self._floored(updated[2])):
             updated = self._updated(slot, z, variance)  # by other particles
-        self.mu[slot], self.sigma[slot], _ = updated
+        self.mean[slot], self.cov[slot], _ = updated
 
     def merge(self, kept: int, other: int) -> None:
         """Two features are one: their estimates are made one, and `other` is removed."""
         if self.weighing:
             self.log_weight += measurement.agreement(self.mu[kept], self.sigma[kept], self.mu[other], self.sigma[other])
-        self.mu[kept], self.sigma[kept] = measurement.fused(
-            self.mu[kept], self.sigma[kept], self.mu[other], self.sigma[other]
+        self.mean[kept], self.cov[kept] = measurement.fused(
+            self.mean[kept], self.cov[kept], self.mu[other], self.sigma[other]
         )
         self.remove(other)
 
@@ -181,7 +209,7 @@ class ParticleFilter:
         if prior is None:
             return
         self._weigh(lambda: measurement.agreement(self.mu[slot], self.sigma[slot], *prior))
-        self.mu[slot], self.sigma[slot] = measurement.fused(self.mu[slot], self.sigma[slot], *prior)
+        self.mean[slot], self.cov[slot] = measurement.fused(self.mean[slot], self.cov[slot], *prior)
         self.priors[slot] = None
 
     def loosen(self, slots: Collection[int], position_m: float, heading_rad: float) -> None:
@@ -194,7 +222,7 @@ class ParticleFilter:
         for slot in slots:
             off = self.mu[slot].T - self.state[:2]
             turned = np.stack([cos * off[0] - sin * off[1], sin * off[0] + cos * off[1]])
-            self.mu[slot] = (self.state[:2] + turned + shift).T
+            self.mean[slot, :, :2] = (self.state[:2] + turned + shift).T
         self.state[:2] += shift
         self.state[HEADING] += turn
         self.state[GNSS_X:] -= shift
@@ -214,6 +242,12 @@ class ParticleFilter:
         xx, xy, yy = weights @ self.sigma[slot]
         return mean, between + np.array([[xx, xy], [xy, yy]])
 
+    def errors_of(self, slot: int, weights: F64) -> tuple[F64, F64]:
+        """Errors of range (share) and bearing [rad] that stay with a feature: means (2,) and variances (2,)."""
+        errors = self.mean[slot, :, 2:]
+        mean = weights @ errors
+        return mean, weights @ (np.square(errors - mean) + self.cov[slot][:, [7, 9]])
+
     def pose(self, weights: F64) -> tuple[F64, F64]:
         """Pose (3,) and covariance (3, 3)."""
         near = self.state[:3].copy()
@@ -226,7 +260,7 @@ class ParticleFilter:
         return np.logaddexp(measurement.agreement(self.mu[slot], self.sigma[slot], *prior), np.log(FLOOR_PER_M2))
 
     def _updated(self, slot: int, z: F64, variance: F64) -> tuple[F64, F64, F64]:
-        return measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
+        return measurement.update(self.state[:3], self.mean[slot], self.cov[slot], z, variance, self.camera)
 
     def _floored(self, log_likelihood: F64) -> F64:
         return np.asarray(np.logaddexp(log_likelihood, np.log(max(_FLOOR, 1e-300))))
@@ -277,12 +311,14 @@ class ParticleFilter:
     def _resample(self, weights: F64) -> None:
         index = systematic(weights, float(self.rng.random()))
         self.log_weight = np.zeros(self.m)
-        self.state, self.mu, self.sigma = self.state[:, index], self.mu[:, index], self.sigma[:, index]
+        self.state, self.mean, self.cov = self.state[:, index], self.mean[:, index], self.cov[:, index]
+        self.camera = self.camera[:, index]
         if _JITTER > 0.0:
             one, other = self.rng.permutation(self.m), self.rng.permutation(self.m)
             self.state[HEADING] = self.state[HEADING, 0] + wrapped(self.state[HEADING] - self.state[HEADING, 0])
             self.state = _spread(self.state, 1, one, other, _JITTER)
-            self.mu = _spread(self.mu, 1, one, other, _JITTER)
+            self.mean = _spread(self.mean, 1, one, other, _JITTER)
+            self.camera = _spread(self.camera, 1, one, other, _JITTER)
 
 
 def _spread(values: F64, axis: int, one: I64, other: I64, h: float) -> F64:

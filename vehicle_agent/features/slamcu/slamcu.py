@@ -6,7 +6,7 @@ existence, those measured gain it (4.3.2); what is new is registered; what exist
 
 from collections.abc import Collection
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, radians
 from typing import Final
 
@@ -23,6 +23,7 @@ from gnd.vehicle_agent.features.slamcu.map_comparison import MapComparison, MapI
 from gnd.vehicle_agent.features.slamcu.noise import GNSS_INTERVAL_S
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
+from gnd.vehicle_agent.features.slamcu.sensor_model import CALIBRATION, SURE_HITS, WRONG, SensorModel
 from gnd.vehicle_agent.features.slamcu.track_list import TrackList
 from gnd.vehicle_agent.features.slamcu.track_management import leave, leave_all, leave_oldest, remove_false_and_double
 from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, TrackedFeature, add_evidence, existence_of
@@ -46,6 +47,9 @@ NEAR_M: Final = 30.0
 """Features so much farther than the view's range cannot be what was measured."""
 TOGETHER_S: Final = 0.1
 """Samples of wheels and gyro are put together for at most so long."""
+KNOWN_MISS: Final = 0.5
+"""A look in which a feature of the map is not seen counts so much, on a vehicle that learns how its camera errs: what
+hides or confuses a sign does so in many looks. A sign that is gone is not seen in any."""
 LEAST_PLAUSIBLE: Final = 1e-3
 """A feature that surely is not there competes for measurements with this share of its likelihood."""
 
@@ -79,6 +83,7 @@ class Slamcu:
         cov0: (3, 3) its covariance.
         seed: of the particles.
         gnss_sigma_m: of the GNSS fixes that the first pose was made of, whose slow error it shares; 0: made otherwise.
+        sensor: what is learnt of the detector while driving; None: its stated noise is all there is.
 
     Attributes:
         now_s: time driven.
@@ -99,6 +104,7 @@ class Slamcu:
         cov0: F64,
         seed: int = 0,
         gnss_sigma_m: float = 0.0,
+        sensor: SensorModel | None = None,
     ) -> None:
         self._confidence = parameters.detection_confidence
         pose0, cov0 = checked_pose(pose0, cov0)
@@ -107,7 +113,9 @@ class Slamcu:
         self._blind = BlindFilter(belief)
         if gnss_sigma_m > 0.0:
             self._particles.seed(belief)
-        self._tracks = TrackList(parameters, known, self._particles)
+        self._tracks = TrackList(parameters, known, self._particles, sensor)
+        if self.sensor.learns:
+            self._particles.calibrate(CALIBRATION)
         self._comparison = MapComparison(self._tracks, self._blind)
         self.now_s = 0.0
         self.odometer_m = 0.0
@@ -178,6 +186,7 @@ class Slamcu:
         self.z_m = z_m
         self._moved = np.zeros(3)
         self._particles.weighing = False
+        self._particles.camera = np.zeros((2, self._particles.m))  # nothing would weigh the particles by it
         self._particles.place(pose, cov)
 
     def pose(self) -> tuple[F64, F64]:
@@ -189,6 +198,22 @@ class Slamcu:
     def blind(self) -> BlindBelief:
         """Where the vehicle is by wheels, gyro and GNSS alone."""
         return self._blind.belief
+
+    @property
+    def sensor(self) -> SensorModel:
+        """What is known of the detector."""
+        return self._tracks.sensor
+
+    @property
+    def camera(self) -> tuple[F64, F64]:
+        """Errors of the camera: mean (2,) and covariance (2, 2) of the share of ranges, and of the bearing [rad]."""
+        return self._particles.calibration()
+
+    @property
+    def camera_is_wrong(self) -> bool:
+        """Whether the camera is surely farther off than a camera may be mounted: `WRONG`."""
+        mean, cov = self.camera
+        return bool((np.abs(mean) - 2.0 * np.sqrt(np.diag(cov)) > WRONG).any())
 
     @property
     def has_fixes(self) -> bool:
@@ -262,11 +287,13 @@ class Slamcu:
         self._looked_ns = look.t_ns
         weights = self._particles.weights()
         near = self._tracks.within(self._particles.state[:2] @ weights, view.range_m + NEAR_M)
-        ahead = forecast(self._particles, weights, near)
+        self._particles.held = self.sensor.held
+        ahead, look = forecast(self._particles, weights, near), self._widened(look)
         found = self._associate(look, near, ahead)
         detected = [near[i] for i in found.feature]
-        missed = self._missed(near, ahead, found.feature, view, occlusion)
-        add_evidence(detected, missed, self._confidence, look.t_ns)  # Eq. (5)
+        self._learn(look, found, near, ahead)
+        missed, counts = self._missed(near, ahead, found.feature, view, occlusion)
+        add_evidence(detected, missed, self._confidence, look.t_ns, counts)  # Eq. (5)
         for feature in detected:
             feature.together.update(other.key for other in detected if other is not feature)
         self._measure(look, found.measurement, detected, weights)
@@ -303,33 +330,59 @@ class Slamcu:
         innovation[..., 1] = wrapped(innovation[..., 1])
         noise = np.zeros((len(look), 1, 2, 2))
         noise[:, 0, [0, 1], [0, 1]] = look.variance
-        same = np.array([[kind == feature.kind for feature in near] for kind in look.kinds], bool).reshape(
-            len(look), len(near)
-        )
-        cost = pair_costs(innovation, ahead.cov[None] + noise, same, _GATE)
+        kinds = np.array([[self.sensor.kind_cost(feature.kinds, kind) for feature in near] for kind in look.kinds])
+        kinds = kinds.reshape(len(look), len(near))
+        cost = kinds + pair_costs(innovation, ahead.cov[None] + noise, np.isfinite(kinds), _GATE)
         plausible = np.array([max(feature.masses[0] + feature.masses[2], LEAST_PLAUSIBLE) for feature in near])
         return associate(cost - np.log(plausible), -np.log(_NEW_DENSITY))
 
+    def _widened(self, look: Look) -> Look:
+        """The look with sigmas as innovations show them to be."""
+        if not self.sensor.learns:
+            return look
+        factor = np.sqrt(self.sensor.white)
+        return replace(
+            look, sigma_range_m=look.sigma_range_m * factor[0], sigma_bearing_rad=look.sigma_bearing_rad * factor[1]
+        )
+
+    def _learn(self, look: Look, found: Association, near: list[TrackedFeature], ahead: Forecast) -> None:
+        """What the features that are known well say about the white noise."""
+        if not self.sensor.learns:
+            return
+        stated = look.variance / self.sensor.white
+        for row, column in zip(found.measurement, found.feature, strict=True):
+            if near[column].slot is not None and near[column].pass_hits >= SURE_HITS:
+                off = np.array([look.range_m[row], look.bearing_rad[row]]) - ahead.z[column]
+                off[1] = float(wrapped(off[1]))
+                self.sensor.measured(off, np.diag(ahead.cov[column]), stated[row])
+
     def _missed(
         self, near: list[TrackedFeature], ahead: Forecast, measured: I64, view: SensorView, occlusion: Occlusion | None
-    ) -> list[TrackedFeature]:
-        """Features well in view that nothing hides and that were not measured: they get Eq. (2)."""
+    ) -> tuple[list[TrackedFeature], list[float]]:
+        """Features well in view that nothing hides and that were not measured: they get Eq. (2), each this often."""
         if not near:
-            return []
+            return [], []
         sigma = _EDGE_SIGMAS * ahead.sigma
         edge_m, edge_rad = np.maximum(sigma[:, 0], _EDGE_M), np.maximum(sigma[:, 1], _EDGE_RAD)
         in_view = view.inside(ahead.z[:, 0], ahead.z[:, 1])
         for i in np.flatnonzero(in_view):
             near[i].in_view_s = self.now_s
-        ask = view.inside(ahead.z[:, 0], ahead.z[:, 1], edge_m, edge_rad)
-        ask[measured] = False
-        rows = np.flatnonzero(ask)
+        rows = np.flatnonzero(view.inside(ahead.z[:, 0], ahead.z[:, 1], edge_m, edge_rad))
+        is_measured = np.isin(rows, measured)
         if occlusion is not None and len(rows):
             height_m = np.array([near[i].height_m for i in rows]) - self.z_m
             clear = occlusion.clear(ahead.z[rows, 0], ahead.z[rows, 1], edge_rad[rows], height_m)
-            self.hidden += sum(near[i].known for i in rows[~clear])
-            rows = rows[clear]
-        return [near[i] for i in rows]
+            self.hidden += sum(near[i].known for i in rows[~clear & ~is_measured])
+            rows, is_measured = rows[clear], is_measured[clear]
+        for i, hit in zip(rows, is_measured, strict=True):
+            near[i].tally.count(float(ahead.z[i, 0]), hit=bool(hit))
+        rows = rows[~is_measured]
+        return [near[i] for i in rows], [self._count_of_a_miss(near[i], float(ahead.z[i, 0])) for i in rows]
+
+    def _count_of_a_miss(self, feature: TrackedFeature, range_m: float) -> float:
+        """What a look counts in which a feature was not seen."""
+        count = self.sensor.miss(range_m)
+        return count * KNOWN_MISS if feature.known and self.sensor.learns else count
 
     def _measure(self, look: Look, rows: I64, detected: list[TrackedFeature], weights: F64) -> None:
         """Section 4.3.4: features that exist are measured; Eq. (16) to (19)."""
@@ -353,7 +406,10 @@ class Slamcu:
 
     def _noted(self, feature: TrackedFeature, look: Look, row: int, weights: F64) -> None:
         feature.in_view_s, feature.odometer_m = self.now_s, self.odometer_m
-        feature.pass_hits += 1
+        feature.pass_hits, feature.is_passed = feature.pass_hits + 1, False
+        feature.named[look.kinds[row]] += 1
+        if not feature.known:
+            feature.kind = feature.named.most_common(1)[0][0]
         if look.height_m is not None and isfinite(look.height_m[row]):
             feature.heights.append(float(look.height_m[row]) + self.z_m)
         if feature.slot is not None and not feature.known:
@@ -375,7 +431,7 @@ class Slamcu:
         seen = feature.measured
         if seen is None and self._tracks.awaits_map(feature):
             seen = self._tracks.moments(feature)
-        xy_m, cov = seen if seen is not None else (None, None)
+        xy_m, cov = (seen[0], seen[1] * self.sensor.places) if seen is not None else (None, None)
         return KnownState(
             feature.number, feature.feature_class, existence_of(feature.masses), feature.hits, feature.misses,
             xy_m, cov, feature.height_m, feature.masses_over_time(),
@@ -388,7 +444,7 @@ class Slamcu:
             assert feature.cov is not None
             xy_m, cov = feature.xy_m, feature.cov[[0, 1, 1, 2]].reshape(2, 2)
         return NewFeature(
-            feature.number, feature.kind, xy_m, cov, feature.height_m, feature.feature_class,
+            feature.number, feature.kind, xy_m, cov * self.sensor.places, feature.height_m, feature.feature_class,
             existence_of(feature.masses), feature.hits, feature.misses, feature.masses_over_time(),
         )  # fmt: skip
 

@@ -4,6 +4,7 @@ A feature that is in sight is estimated in a slot of the particle filter. Here i
 begun, ended, merged or taken for another; nothing is decided here.
 """
 
+from collections import Counter
 from collections.abc import Collection
 from math import nan
 from typing import Final
@@ -15,6 +16,7 @@ from gnd.vehicle_agent.features.errors import BadMapFeatures
 from gnd.vehicle_agent.features.look import MapFeatures
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.particle_filter import ParticleFilter
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel, Tally
 from gnd.vehicle_agent.features.slamcu.tracked_feature import KNOWN_MASSES, NEW_MASSES, TrackedFeature, recount
 
 MAP_SIGMA_M: Final = 0.05
@@ -28,16 +30,24 @@ class TrackList:
         parameters: of existence.
         known: the map's features.
         particles: where features are estimated.
+        sensor: what is known of the detector; None: its stated noise is all there is.
 
     Attributes:
-        particles: as given.
+        particles, sensor: as given.
         known: the map's features, in its order.
         new: the others.
         live: those that are estimated; the place in this list is the slot.
     """
 
-    def __init__(self, parameters: SlamcuParameters, known: MapFeatures, particles: ParticleFilter) -> None:
+    def __init__(
+        self,
+        parameters: SlamcuParameters,
+        known: MapFeatures,
+        particles: ParticleFilter,
+        sensor: SensorModel | None = None,
+    ) -> None:
         self._parameters, self.particles = parameters, particles
+        self.sensor = sensor or SensorModel(parameters.detection_confidence, learns=False)
         self.known: list[TrackedFeature] = []
         self.new: list[TrackedFeature] = []
         self.live: list[TrackedFeature] = []
@@ -97,7 +107,7 @@ class TrackList:
         self.end(feature)
         self.new.remove(feature)
 
-    def recount(self, feature: TrackedFeature, hits: int, misses: int, t_ns: int) -> None:
+    def recount(self, feature: TrackedFeature, hits: int, misses: float, t_ns: int) -> None:
         """The feature's evidence anew, from counts."""
         recount(feature, hits, misses, self._parameters.detection_confidence, t_ns)
 
@@ -105,6 +115,7 @@ class TrackList:
 
     def begin(self, feature: TrackedFeature, z: F64, variance: F64) -> None:
         """Estimate a feature from this first measurement on; z, variance: (2,) of range and bearing."""
+        self.particles.held = feature.held = self.sensor.held
         self.particles.add(z, variance, feature.prior)
         feature.slot, feature.pass_hits, feature.pass_misses = len(self.live), 0, 0
         self.live.append(feature)
@@ -136,9 +147,11 @@ class TrackList:
 
     def unite(self, kept: TrackedFeature, other: TrackedFeature) -> None:
         """The estimates of two features become one, that of `kept`."""
+        kept.named.update(other.named)
         if other.slot is None:
             return
         if kept.slot is None:
+            kept.held = other.held
             self.live[other.slot] = kept
             kept.slot, other.slot = other.slot, None
             kept.pass_hits, kept.pass_misses = other.pass_hits, other.pass_misses
@@ -152,6 +165,8 @@ class TrackList:
         slot, giver.slot = giver.estimated_in, None
         self.live[slot] = taker
         taker.slot, taker.pass_hits, taker.cov = slot, giver.pass_hits, None
+        taker.named, giver.named, taker.tally, giver.tally = giver.named, Counter(), giver.tally, Tally()
+        taker.held = giver.held
         self.particles.priors[slot] = None
 
     def hand_back(self, giver: TrackedFeature, taker: TrackedFeature) -> None:
@@ -160,6 +175,7 @@ class TrackList:
             slot, giver.slot = giver.slot, None
             self.live[slot] = taker
             taker.slot, taker.pass_hits, taker.pass_misses = slot, giver.pass_hits, giver.pass_misses
+            taker.named, taker.tally, taker.held = giver.named, giver.tally, giver.held
             self.particles.priors[slot] = taker.prior
         self.drop(giver)
 
@@ -168,7 +184,7 @@ class TrackList:
         for feature, slot in ((one, other.estimated_in), (other, one.estimated_in)):
             feature.slot = slot
             self.live[slot], self.particles.priors[slot] = feature, feature.prior
-        for name in ("pass_hits", "pass_misses", "in_view_s", "odometer_m", "heights"):
+        for name in ("pass_hits", "pass_misses", "in_view_s", "odometer_m", "heights", "named", "tally", "held"):
             before = getattr(one, name)
             setattr(one, name, getattr(other, name))
             setattr(other, name, before)

@@ -7,6 +7,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.map_comparison import ENOUGH_HITS
+from gnd.vehicle_agent.features.slamcu.sensor_model import LN_SIGN, Tally
 from gnd.vehicle_agent.features.slamcu.track_list import TrackList
 from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, TrackedFeature
 
@@ -31,19 +32,34 @@ def remove_false_and_double(tracks: TrackList, near: Sequence[TrackedFeature], t
             tracks.drop(feature)
             continue
         for other in near:
-            if other is not feature and other.kind == feature.kind and _same(tracks, other, feature):
+            alike = other.kind == feature.kind or tracks.sensor.learns  # else its kind may have been confused
+            if other is not feature and alike and _same(tracks, other, feature):
                 _merge(tracks, other, feature, t_ns)
                 break
 
 
 def leave(tracks: TrackList, feature: TrackedFeature, odometer_m: float) -> None:
     """A feature out of view is estimated no longer: the map's at once, a new one when it can learn little more."""
+    learn_of(tracks, feature)
     if feature.known:
         tracks.end(feature)
     elif feature.feature_class != FeatureClass.NEW:
         tracks.drop(feature)
     elif odometer_m - feature.odometer_m > HORIZON_M:
         tracks.freeze(feature)
+
+
+def learn_of(tracks: TrackList, feature: TrackedFeature) -> None:
+    """What a feature that has been passed says of the sensor, and whether a new one is a sign at all."""
+    sensor, tally = tracks.sensor, feature.tally
+    if not sensor.learns or feature.is_passed:
+        return
+    feature.is_passed = True
+    if not feature.known and not feature.is_clutter:
+        feature.is_clutter = sensor.ln_sign(tally, feature.named) < LN_SIGN
+    if feature.feature_class in (FeatureClass.NORMAL, FeatureClass.NEW) and feature.hits >= ENOUGH_HITS:
+        sensor.passed(tally, feature.named, feature.kind)
+    feature.tally = Tally()
 
 
 def leave_oldest(tracks: TrackList) -> None:
@@ -72,7 +88,8 @@ def _same(tracks: TrackList, other: TrackedFeature, feature: TrackedFeature) -> 
     if feature.slot is None or (not other.known and (other.slot is None or other.number > feature.number)):
         return False
     hits = min(feature.hits, max(other.pass_hits, 1))
-    if feature.hits + other.pass_hits < ENOUGH_HITS or feature.together[other.key] > TOGETHER_SHARE * hits:
+    apart = TOGETHER_SHARE * hits if not tracks.sensor.learns else max(TOGETHER_SHARE * hits, 1)
+    if feature.hits + other.pass_hits < ENOUGH_HITS or feature.together[other.key] > apart:
         return False
     off, cov = _apart(tracks, other, feature)
     return float(np.hypot(*off)) < SAME_M and float(off @ np.linalg.solve(cov, off)) < SAME_GATE
@@ -98,5 +115,7 @@ def _merge(tracks: TrackList, kept: TrackedFeature, other: TrackedFeature, t_ns:
     kept.in_view_s = max(kept.in_view_s, other.in_view_s)
     kept.odometer_m = max(kept.odometer_m, other.odometer_m)
     kept.heights += other.heights
+    if kept.named and not kept.known:
+        kept.kind = kept.named.most_common(1)[0][0]
     tracks.recount(kept, hits, max(kept.misses - other.hits, 0), t_ns)
     tracks.drop(other)

@@ -11,6 +11,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import VACUOUS, Existence, combine, hit, miss, prior
+from gnd.vehicle_agent.features.slamcu.sensor_model import MAP_SAYS, Tally
 
 MAP_CONFIDENCE: Final = 0.95
 """λ_HD of Eq. (3)."""
@@ -64,7 +65,7 @@ class TrackedFeature:
         z_m: height in the map, nan = unknown.
         masses: (4,) exist, absent, unknown, conflict.
         hits: measurements of it.
-        misses: looks in which it was in view and was not measured.
+        misses: looks in which it was in view and was not measured, each as `SensorModel.miss` counts it.
         slot: its place in the particles; None: it is not estimated there.
         pass_hits: hits since it is estimated there.
         pass_misses: misses since.
@@ -74,6 +75,11 @@ class TrackedFeature:
         measured: (2,) and (2, 2), where this drive measured a feature of the map, independently of the map.
         together: how often it and another (by key) were measured in one look: those are two features.
         history: times and masses of the last evidence.
+        named: how often it was measured as which kind.
+        tally: looks at it that were well in view, by range.
+        held: (2,) variances of the errors that stay with it, before it was estimated.
+        is_passed: whether it has been out of view since it was last measured.
+        is_clutter: its detections are those of something that is taken for a sign now and then.
     """
 
     number: int
@@ -84,20 +90,26 @@ class TrackedFeature:
     z_m: float
     masses: F64
     hits: int = 0
-    misses: int = 0
+    misses: float = 0.0
     slot: int | None = None
     pass_hits: int = 0
-    pass_misses: int = 0
+    pass_misses: float = 0.0
     in_view_s: float = 0.0
     odometer_m: float = 0.0
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=HISTORY))
     measured: tuple[F64, F64] | None = None
     together: Counter[int] = field(default_factory=Counter)
     history: deque[tuple[int, F64]] = field(default_factory=lambda: deque(maxlen=HISTORY))
+    named: Counter[str] = field(default_factory=Counter)
+    tally: Tally = field(default_factory=Tally)
+    held: F64 = field(default_factory=lambda: np.zeros(2))
+    is_passed: bool = False
+    is_clutter: bool = False
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "TrackedFeature":
         """A copy that goes its own way: arrays are only ever replaced, never written into, and may be shared."""
         copied = replace(self, heights=self.heights.copy(), history=self.history.copy(), together=self.together.copy())
+        copied.named, copied.tally = self.named.copy(), Tally(self.tally.looks.copy(), self.tally.hits.copy())
         memo[id(self)] = copied
         return copied
 
@@ -128,8 +140,16 @@ class TrackedFeature:
         state = existence_of(self.masses).state
         if self.known:
             return {"exist": FeatureClass.NORMAL, "absent": FeatureClass.DELETED}.get(state, FeatureClass.UNCLASSIFIED)
-        is_new = state == "exist" and self.hits >= _MIN_HITS
+        is_new = state == "exist" and self.hits >= _MIN_HITS and not self.is_clutter
         return FeatureClass.NEW if is_new else FeatureClass.UNCLASSIFIED
+
+    @property
+    def kinds(self) -> dict[str, float]:
+        """Detections by kind, with what the map says of it counted as `MAP_SAYS` of them."""
+        found: dict[str, float] = dict(self.named)
+        if self.known or not found:
+            found[self.kind] = found.get(self.kind, 0.0) + MAP_SAYS
+        return found
 
     @property
     def exists(self) -> bool:
@@ -142,27 +162,40 @@ class TrackedFeature:
 
 
 def add_evidence(
-    detected: Sequence[TrackedFeature], missed: Sequence[TrackedFeature], confidence: float, t_ns: int
+    detected: Sequence[TrackedFeature],
+    missed: Sequence[TrackedFeature],
+    confidence: float,
+    t_ns: int,
+    counts: Sequence[float] | None = None,
 ) -> None:
-    """Detected features get Eq. (1), those in view that were not detected Eq. (2), with λ, all by Eq. (5)."""
-    touched = [*detected, *missed]
+    """Detected features get Eq. (1), those in view that were not detected Eq. (2), with λ, all by Eq. (5).
+
+    Args:
+        detected: features that were measured.
+        missed: those that were not.
+        confidence: λ.
+        t_ns: when.
+        counts: what the miss of each missed one counts; None: 1.
+    """
+    touched, counts = [*detected, *missed], [1.0] * len(missed) if counts is None else counts
     if not touched:
         return
-    new = np.array([row(hit(confidence))] * len(detected) + [row(miss(confidence))] * len(missed))
+    unseen = [row(miss(1.0 - (1.0 - confidence) ** count)) for count in counts]
+    new = np.array([row(hit(confidence))] * len(detected) + unseen)
     masses = bounded_below(combine(np.array([feature.masses for feature in touched]), new))
     for feature, after in zip(touched, masses, strict=True):
         feature.masses = after
         feature.history.append((t_ns, after))
     for feature in detected:
         feature.hits += 1
-    for feature in missed:
-        feature.misses += 1
-        feature.pass_misses += 1
+    for feature, count in zip(missed, counts, strict=True):
+        feature.misses += count
+        feature.pass_misses += count
 
 
-def recount(feature: TrackedFeature, hits: int, misses: int, confidence: float, t_ns: int) -> None:
+def recount(feature: TrackedFeature, hits: int, misses: float, confidence: float, t_ns: int) -> None:
     """Masses from counts, whose order does not matter: hits turned out to be misses, or another feature's."""
-    feature.hits, feature.misses = max(hits, 0), max(misses, 0)
+    feature.hits, feature.misses = max(hits, 0), max(misses, 0.0)
     masses = KNOWN_MASSES if feature.known else NEW_MASSES
     feature.masses = bounded_below(counted(masses, feature.hits, feature.misses, confidence)[None])[0]
     feature.history.append((t_ns, feature.masses))
@@ -173,7 +206,7 @@ def existence_of(masses: F64) -> Existence:
     return Existence(*(float(mass) for mass in masses))
 
 
-def counted(masses: F64, hits: int, misses: int, confidence: float) -> F64:
+def counted(masses: F64, hits: int, misses: float, confidence: float) -> F64:
     """Masses (4,) after so many times Eq. (1) and Eq. (2), in any order.
 
     Dempster's rule multiplies commonalities q(A) = Σ_{B ⊇ A} m(B); here in logarithms, as thousands of looks underflow.

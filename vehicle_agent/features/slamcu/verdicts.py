@@ -16,7 +16,7 @@ class KnownState:
         feature_class: normal, deleted or unclassified.
         existence: masses, begun with λ_HD (Eq. 3).
         hits: looks that measured it.
-        misses: looks in which it was in view and was not measured.
+        misses: looks in which it was in view and was not measured, less where the sensor often misses.
         position_m: (2,) where this drive measured it, independently of where the map has it; None = not measured.
         cov_m2: (2, 2) of that position.
         height_m: in the map frame, as far as the vehicle knows its own height there; nan = not measured.
@@ -27,7 +27,7 @@ class KnownState:
     feature_class: FeatureClass
     existence: Existence
     hits: int
-    misses: int
+    misses: float
     position_m: F64 | None
     cov_m2: F64 | None
     height_m: float
@@ -47,7 +47,7 @@ class NewFeature:
         feature_class: new, or unclassified while there is too little evidence.
         existence: masses, begun vacuous (Eq. 4).
         hits: looks that measured it.
-        misses: looks in which it was in view and was not measured.
+        misses: looks in which it was in view and was not measured, less where the sensor often misses.
         history: masses over time, Figure 8.
     """
 
@@ -59,5 +59,5 @@ class NewFeature:
     feature_class: FeatureClass
     existence: Existence
     hits: int
-    misses: int
+    misses: float
     history: tuple[MassesAt, ...] = field(default=(), repr=False)

@@ -41,6 +41,7 @@ from gnd.vehicle_agent.features.slamcu.replay import (
     SlamcuEvent,
     WatchedRun,
 )
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
@@ -126,8 +127,9 @@ class WatchedSlamcu:
         cov0: F64,
         seed: int = 0,
         gnss_sigma_m: float = 0.0,
+        sensor: SensorModel | None = None,
     ) -> None:
-        self._run = WatchedRun(Slamcu(parameters, known, pose0, cov0, seed, gnss_sigma_m), Watch())
+        self._run = WatchedRun(Slamcu(parameters, known, pose0, cov0, seed, gnss_sigma_m, sensor), Watch())
         self._log = DriveLog(self._run, seed)
         self.lost: list[Lost] = []
         self.doubts = 0
@@ -222,6 +224,16 @@ class WatchedSlamcu:
         pose, cov = self._slamcu.pose()
         wide = claimed_now(pose, cov, self._slamcu.blind) if self._slamcu.has_fixes else held(cov[None])[0]
         return pose, wide + np.diag([LOST_M**2, LOST_M**2, 0.0]) if self.is_lost else wide
+
+    @property
+    def camera(self) -> tuple[F64, F64]:
+        """As of `Slamcu`."""
+        return self._slamcu.camera
+
+    @property
+    def camera_is_wrong(self) -> bool:
+        """As of `Slamcu`."""
+        return self._slamcu.camera_is_wrong
 
     @property
     def is_lost(self) -> bool:
