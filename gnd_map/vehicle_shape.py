@@ -34,11 +34,11 @@ SEVERAL: Final = 4
 LEAST_HEIGHT_M: Final = 0.35
 """Several voxels that hold less than this from bottom to top are a plate."""
 VAN_TOP_M: Final = 2.9
-WIDTH_M: Final = (1.3, 4.0)
+WIDTH_M: Final = (1.3, 4.5)
 LENGTH_M: Final = (2.5, 9.0)
 GAP_M: Final = 0.1
 """Cars that stand in a row have gaps between them."""
-ROW_RUN_M: Final = (2.0, 11.0)
+ROW_RUN_M: Final = (1.7, 11.0)
 """The longest stretch without a gap of a row that is longer than one car."""
 MOST_CONTACT: Final = 0.5
 """What touches a higher thing with more of its voxels is a part of that."""
