@@ -36,6 +36,8 @@ LEAST_HEIGHT_M: Final = 0.35
 VAN_TOP_M: Final = 2.9
 WIDTH_M: Final = (1.3, 4.5)
 LENGTH_M: Final = (2.5, 9.0)
+SHORT_M: Final = (3.4, 1.8)
+"""What is shorter than this and higher than that is no part of a car: a van that is seen so high is seen longer."""
 GAP_M: Final = 0.1
 """Cars that stand in a row have gaps between them."""
 ROW_RUN_M: Final = (1.7, 11.0)
@@ -103,6 +105,8 @@ def _shape(low: F64, top: F64, at: F64, cov: F64) -> Shape:
         is_van = roof <= VAN_TOP_M and 1.5 <= width <= 2.9 and 3.5 <= length <= 7.5
         return "vehicle" if is_van else "none"
     if len(at) >= SEVERAL and roof - bottom < LEAST_HEIGHT_M:
+        return "none"
+    if length < SHORT_M[0] and roof > SHORT_M[1]:
         return "none"
     is_one = LENGTH_M[0] <= length <= LENGTH_M[1]
     is_row = length > LENGTH_M[1] and ROW_RUN_M[0] <= run <= ROW_RUN_M[1]
