@@ -8,7 +8,7 @@ from click.testing import CliRunner, Result
 
 from gnd.deploy.cli import gnd
 
-STREET = ("--world-seed", "5", "--length", "100", "--edits", "1", "--scans", "12", "--no-traffic", "--base", "surveyed")
+STREET = ("--world-seed", "5", "--length", "100", "--edits", "1", "--scans", "24", "--no-traffic", "--base", "surveyed")
 DRIVES = ("--drives", "3", "--at-once", "2", "--pcd-drives", "0", "--f1-drives", "2", "--jobs", "1")
 
 
