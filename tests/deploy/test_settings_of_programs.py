@@ -33,7 +33,7 @@ WORDS = {
     "layers": ("ndt", "signs"), "passing_rule": "ahead", "protocol": "full", "mode": "paper",
     "source": "",  # another needs that there is no recording
     "points": "/a/points", "gnss": "/a/fix", "speed": "/a/odometry", "imu": "/a/imu", "vehicle_frame": "base",
-    "mount": (0.5, 0.0, 1.5, 0.0, 0.0, 90.0),
+    "mount": (0.5, 0.0, 1.5, 0.0, 0.0, 90.0), "family": "suburb",
 }  # fmt: skip
 
 
@@ -63,6 +63,8 @@ def candidates(name: str, value: Any, told: Any) -> list[Any]:
         return [value + 1, value - 1]
     if isinstance(value, float):
         return [value * 0.999 or 0.25, value * 1.001, value + 0.25, value - 0.01]
+    if name == "parking":
+        return [0.35]
     if isinstance(value, Path) or value is None:
         return [Path("other/place")]
     if isinstance(value, dict):

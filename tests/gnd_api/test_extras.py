@@ -110,7 +110,7 @@ def test_a_map_is_read(cloud: Cloud, bare: Callable[..., Program]) -> None:
 
 
 COMMANDS = {
-    "sim world picture street.json street.png": ("sim", "matplotlib"),
+    "sim world picture street.json street.png": ("sim", "scipy"),
     "merger --help": ("cloud", "scipy"),
     "localise --help": ("vehicle", r"\w+"),
 }
