@@ -32,6 +32,7 @@ from gnd.cloud_merger.parameters import (
 )
 from gnd.cloud_merger.parked import (
     PARKED_FREE_SHARE,
+    PARKED_FREE_WEIGHT,
     PARKED_MOST_H,
     PARKED_PLACE_GOINGS,
     PARKED_SEEN_SHARE,
@@ -78,6 +79,7 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
         "seen_share": PARKED_SEEN_SHARE,
         "there_share": PARKED_THERE_SHARE,
         "free_share": PARKED_FREE_SHARE,
+        "free_weight": PARKED_FREE_WEIGHT,
     },
     "shift": {
         "max_m": SHIFT_MAX_M,

@@ -36,6 +36,8 @@ PARKED_THERE_SHARE: Final = 0.5
 """Of those it must hold at least this share to have seen the thing, ..."""
 PARKED_FREE_SHARE: Final = 0.2
 """... and at most this share to have seen that it is gone."""
+PARKED_FREE_WEIGHT: Final = 0.75
+"""A report whose vote weighs less (few layers, poor poses) does not tell that a place is free: it misses things."""
 MOST_GOINGS: Final = 255
 _NS_PER_H: Final = 3600 * 1_000_000_000
 
@@ -110,11 +112,15 @@ def parked_after(
         reports: of the window.
         bases: Gaussians of the tile's versions by hash.
     """
+    if not len(before):
+        return held
     rest = before[~are_in(before["voxel_id"], held["voxel_id"])].copy()
     rest["since_ns"][are_in(rest["voxel_id"], published)] = 0  # no longer parked: it is the map
     newest = np.full(len(rest), -1, np.int8)
     for spoken in (_Spoken.of(one, bases) for one in sorted(reports, key=lambda one: one.turn)):
-        seen = are_in(rest["voxel_id"], spoken.observed)
+        seen = are_in(rest["voxel_id"], spoken.observed) & (spoken.at_ns >= rest["since_ns"])
+        if not spoken.tells_free:
+            seen &= are_in(rest["voxel_id"], spoken.there)
         newest[seen] = are_in(rest["voxel_id"][seen], spoken.there)
     gone = (newest == 0) & (rest["since_ns"] > 0)
     rest["goings"][gone] = np.minimum(rest["goings"][gone].astype(int) + 1, MOST_GOINGS)
@@ -129,6 +135,7 @@ class _Spoken:
     """What a report says of any voxel: those it observed, and those that hold something by its word; sorted ids."""
 
     at_ns: int
+    tells_free: bool
     observed: I32
     there: I32
 
@@ -140,7 +147,8 @@ class _Spoken:
         unchanged = report.change.observed[~are_in(report.change.observed, ids)]
         base = bases.get(report.change.base_sha, Gaussians.empty()).voxel_id
         observed = unique(np.concatenate([unchanged, ids[changed.speaks]]))
-        return cls(report.last_ns, observed, unique(np.concatenate([there, unchanged[are_in(unchanged, base)]])))
+        there = unique(np.concatenate([there, unchanged[are_in(unchanged, base)]]))
+        return cls(report.last_ns, report.weight >= PARKED_FREE_WEIGHT, observed, there)
 
 
 def _things(tile: TileId, epoch: Gaussians, new: Gaussians, before: ParkedVoxels) -> list[I32]:
@@ -168,7 +176,7 @@ def _stood(group: I32, before: ParkedVoxels, spoken: Iterable[_Spoken]) -> tuple
         share = float(are_in(seen, one.there).mean())
         if share >= PARKED_THERE_SHARE:
             since, until = one.at_ns if since is None else min(since, one.at_ns), one.at_ns
-        elif share <= PARKED_FREE_SHARE:
+        elif share <= PARKED_FREE_SHARE and one.tells_free and (since is None or one.at_ns >= since):
             went += since is not None
             since = until = None
     return (0, 0, went) if since is None or until is None else (since, until, went)

@@ -55,7 +55,7 @@ class Street:
     def head(self):
         return self.store.get("ndt", TILE).decode_gaussians().gaussians
 
-    def sees(self, vehicle, hour, *things):
+    def sees(self, vehicle, hour, *things, sensor="VLP-16"):
         """A vehicle drives by and sees these things, and nothing else that the newest map does not hold."""
         self.now_ns = START_NS + round(hour * HOUR_NS)
         self.number += 1
@@ -65,7 +65,7 @@ class Street:
         changed |= {v: None for v in held & {*CAR, *HOUSE} if v not in there}
         change = change_of(head, SEEN, changed)
         times = {"first_ns": self.now_ns - 10**9, "last_ns": self.now_ns}
-        report = replace(report_of(self.number, change, vehicle=vehicle), **times)
+        report = replace(report_of(self.number, change, vehicle=vehicle), sensor_model=sensor, **times)
         ((tile, body),) = split(report)
         self.store.put_reports([ReportRow(report.report_id, "ndt", tile, vehicle, self.now_ns, body, change.base_sha)])
         worker = Worker(self.store, self.config)
@@ -118,6 +118,24 @@ def test_one_vehicle_alone_makes_no_parked_car_a_change(street):
     for hour in (0, 0.2, 0.4):
         street.sees("car", hour, CAR)
     assert street.holds(CAR) == 0.0
+
+
+def test_a_lidar_of_few_layers_that_misses_a_thing_does_not_keep_it_from_the_map(street):
+    for k, hour in enumerate(range(0, 21, 2)):
+        street.sees(f"car-{k}", hour, CAR)
+        if k % 4 == 3:
+            street.sees(f"few-{k}", hour + 1, sensor="Scala")
+    assert street.holds(CAR) == 1.0
+
+
+def test_a_late_report_from_before_the_thing_came_does_not_end_its_stay(tmp_path):
+    street = Street(tmp_path / "map.sqlite", window_reports=2)
+    for k, hour in enumerate([10, 11, 12, 20]):
+        street.sees(f"car-{k}", hour, CAR)
+    street.sees("late", 5)
+    street.sees("car-9", 29, CAR)
+    assert street.holds(CAR) == 1.0
+    street.store.close()
 
 
 def test_the_order_in_which_reports_are_merged_changes_nothing(tmp_path):

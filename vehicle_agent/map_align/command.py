@@ -96,11 +96,7 @@ def _print(console: Console, values: dict[str, Any]) -> None:
         "second best place": f"{100 * values['second_best']['worth']:.0f} % of the best",
         "parts off their place": f"at most {100 * values['bend_m']:.1f} cm in 85 % of {len(values['blocks'])} blocks",
     }
-    console.print(tables.fields(f"{values['b']} on {values['a']}", plain))
-    for reason in values["reasons"]:
-        console.print(f"does not fit: {reason}", style="red", highlight=False)
-    if values["fits"]:
-        console.print("fits" + (f", written: {values['written']}" if values["written"] else ""), highlight=False)
+    _print_verdict(console, values, plain)
 
 
 def _print_posts(console: Console, values: dict[str, Any]) -> None:
@@ -113,6 +109,10 @@ def _print_posts(console: Console, values: dict[str, Any]) -> None:
         "second best place": f"{100 * values['second_best']:.0f} % of the best",
         "mirror image": f"{100 * values['mirror_image']:.0f} % of the best",
     }
+    _print_verdict(console, values, plain)
+
+
+def _print_verdict(console: Console, values: dict[str, Any], plain: dict[str, str]) -> None:
     console.print(tables.fields(f"{values['b']} on {values['a']}", plain))
     for reason in values["reasons"]:
         console.print(f"does not fit: {reason}", style="red", highlight=False)
