@@ -17,6 +17,7 @@ from gnd.cloud_merger.confirmation import (
 )
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.association import FEATURE_LINE_REACH_M
+from gnd.cloud_merger.features.drive_shift import FEATURE_SHIFT_DOUBTED_FROM
 from gnd.cloud_merger.features.existence import FEATURE_ABSENCE, FEATURE_CEILING, FEATURE_PRIOR, FEATURE_VIEW_MARGIN_M
 from gnd.cloud_merger.features.parameters import FEATURE_GATE, FeatureMergeParameters
 from gnd.cloud_merger.features.publication import FEATURE_MOST_WEIGHT, FEATURE_RENEWAL_MASS, FEATURE_VOTERS
@@ -51,6 +52,7 @@ from gnd.cloud_merger.shift import (
 from gnd.gnd_map.config import from_mapping, to_mapping
 from gnd.gnd_map.errors import ConfigError
 from gnd.gnd_map.settings import merged
+from gnd.gnd_map.vehicle_shape import BOUNDS
 from gnd.schemas.feature_layer import LayerParameters
 
 _FORMAT: Final = 1
@@ -81,6 +83,7 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
         "free_share": PARKED_FREE_SHARE,
         "free_weight": PARKED_FREE_WEIGHT,
     },
+    "vehicle_shape": BOUNDS,
     "shift": {
         "max_m": SHIFT_MAX_M,
         "max_rad": SHIFT_MAX_RAD,
@@ -102,6 +105,7 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
         "most_weight": FEATURE_MOST_WEIGHT,
         "renewal_mass": FEATURE_RENEWAL_MASS,
         "max_begun": FEATURE_MAX_BEGUN,
+        "shift_doubted_from": FEATURE_SHIFT_DOUBTED_FROM,
         "ceiling": FEATURE_CEILING,
     },
 }

@@ -50,6 +50,34 @@ BELOW_GROUND_M: Final = -0.3
 RAISED_M: Final = 0.05
 """The side of a car begins above the ground: below its sills the road is seen."""
 
+BOUNDS: Final[dict[str, float]] = {
+    "ground_reach_m": GROUND_REACH_M,
+    "ground_below_m": GROUND_BELOW_M,
+    "flat_sigma_m": FLAT_SIGMA_M,
+    "edge_sigmas": EDGE_SIGMAS,
+    "bottom_m": BOTTOM_M,
+    "top_least_m": TOP_M[0],
+    "top_most_m": TOP_M[1],
+    "van_top_m": VAN_TOP_M,
+    "several": SEVERAL,
+    "least_height_m": LEAST_HEIGHT_M,
+    "width_least_m": WIDTH_M[0],
+    "width_most_m": WIDTH_M[1],
+    "length_least_m": LENGTH_M[0],
+    "length_most_m": LENGTH_M[1],
+    "short_length_m": SHORT_M[0],
+    "short_top_m": SHORT_M[1],
+    "gap_m": GAP_M,
+    "row_run_least_m": ROW_RUN_M[0],
+    "row_run_most_m": ROW_RUN_M[1],
+    "most_contact": MOST_CONTACT,
+    "side_width_m": SIDE_M[0],
+    "side_length_m": SIDE_M[1],
+    "below_ground_m": BELOW_GROUND_M,
+    "raised_m": RAISED_M,
+}
+"""By name: a map depends on all of them."""
+
 
 def has_vehicle_shape(grid: VoxelGrid, before: Gaussians, new: Gaussians) -> Mask:
     """Which of some Gaussians are of a group that has the shape of a standing vehicle.

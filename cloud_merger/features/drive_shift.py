@@ -7,12 +7,14 @@ s_i ~ N(0, S I), one of each drive, of which nobody tells the size. S follows fr
 covariance of the estimate is that of Σ K_i y_i under C_i + S I.
 """
 
+from typing import Final
+
 import numpy as np
 
 from gnd.cloud_merger.features.rls import PlaceEstimate
 from gnd.gnd_map.arrays import F64
 
-DOUBTED_FROM: float = 8.0
+FEATURE_SHIFT_DOUBTED_FROM: Final = 8.0
 """Degrees of freedom that speak for the drives' covariances before any are compared: two drives that happen to disagree
 say little of how far drives are off in common, ten say much."""
 
@@ -46,7 +48,7 @@ class DriveShift:
         C, free = np.linalg.inv(self._W), 2.0 * (self._n - 1)
         scatter = self._yWy - float(self._Wy @ C @ self._Wy)
         spent = float(self._trace - np.trace(C @ self._WW))
-        return max(scatter - free, 0.0) / max(spent, 1e-12) * free / (free + DOUBTED_FROM)
+        return max(scatter - free, 0.0) / max(spent, 1e-12) * free / (free + FEATURE_SHIFT_DOUBTED_FROM)
 
     def added_m2(self) -> F64:
         """(2, 2) by how much the shifts make the mean of all drives less certain: Σ K_i S K_iᵀ with K_i = C W_i."""

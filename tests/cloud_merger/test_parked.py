@@ -1,6 +1,7 @@
 """What parks is no change, however many saw it within the hour; what stays is one."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +11,14 @@ from merger_world import TILE, change_of, gaussians_of, report_of
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.confirmation import ConfirmationParameters
+from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.map_parameters import text_of, with_text
 from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.parked import PARKED_PLACE_GOINGS
 from gnd.cloud_merger.stored import decode_state
 from gnd.cloud_merger.verify import Verifier
 from gnd.cloud_merger.work import Worker
+from gnd.gnd_map import vehicle_shape
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.changes import split
@@ -190,3 +193,15 @@ def test_a_memory_of_before_has_nothing_parked():
     old = json.dumps(head | {"format": 1}).encode()
     body = zstandard.ZstdCompressor().compress(len(old).to_bytes(4, "little") + old + data[n:])
     assert len(TileMemory.decode(body).parked) == 0
+
+
+def test_every_bound_of_a_vehicles_shape_travels_with_the_map():
+    """A release with another bound knows that it computes another map."""
+    bounds = [
+        value for name, value in vars(vehicle_shape).items() if re.fullmatch(r"[A-Z_]+", name) and name != "BOUNDS"
+    ]
+    numbers = [number for bound in bounds for number in (bound if isinstance(bound, tuple) else (bound,))]
+    assert sorted(numbers) == sorted(vehicle_shape.BOUNDS.values())
+    text = text_of(ShardConfig()).replace('"top_most_m":2.3', '"top_most_m":2.4')
+    with pytest.raises(MergerError, match=r"vehicle_shape\.top_most_m is 2\.4; it is 2\.3"):
+        with_text(ShardConfig(), text)
