@@ -24,7 +24,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile_id import TileId
 from gnd.gnd_map.vehicle_shape import has_vehicle_shape
-from gnd.tile_store.values import Unconfirmed
+from gnd.tile_store.values import Unconfirmed, WaitingReason
 
 PARKED_MOST_H: Final = 14 * 24.0
 """No place is so much of a parking place that what stands there for two weeks is not published."""
@@ -93,7 +93,11 @@ def hold_parked(
         return ParkedTile(merged)
     voxels = np.concatenate(held)
     voxels = voxels[np.argsort(voxels["voxel_id"])]
-    return ParkedTile(merged.without(voxels["voxel_id"].tolist()), voxels, _waiting(voxels, merged, epoch, reports))
+    return ParkedTile(
+        merged.without(voxels["voxel_id"].tolist()),
+        voxels,
+        waiting_of(voxels["voxel_id"], merged, epoch, reports, "parked"),
+    )
 
 
 def parked_after(
@@ -193,18 +197,18 @@ def _rows(group: I32, since_ns: int, goings: I64) -> ParkedVoxels:
     return rows
 
 
-def _waiting(
-    voxels: ParkedVoxels, merged: MergedTile, epoch: Gaussians, reports: Sequence[Report]
+def waiting_of(
+    voxels: I32, merged: MergedTile, epoch: Gaussians, reports: Sequence[Report], reason: WaitingReason
 ) -> tuple[Unconfirmed, ...]:
     """What waits, told of the vehicle whose report about it comes first."""
     vehicle = {one.report_id: one.vehicle for one in reports}
     claims: dict[str, list[tuple[str, ...]]] = {}
-    for voxel in voxels["voxel_id"].tolist():
+    for voxel in voxels.tolist():
         ids = merged.provenance[voxel]
         first = min((vehicle[one] for one in ids if one in vehicle), default="")
         claims.setdefault(first, []).append(ids)
     return tuple(
         Unconfirmed(name, tuple(sorted({one for ids in claimed for one in ids})), len(claimed),
-                    max(seen_of(name, epoch, reports), len(claimed)), "parked")
+                    max(seen_of(name, epoch, reports), len(claimed)), reason)
         for name, claimed in sorted(claims.items())
     )  # fmt: skip

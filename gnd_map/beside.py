@@ -46,3 +46,18 @@ def _root(group: I64, i: int) -> int:
         group[i] = group[group[i]]
         i = group[i]
     return i
+
+
+@kernel
+def count_beside(index: I64, others: I64) -> I64:
+    """(N,) how many of other voxels lie beside each voxel (N, 3), across an edge or a corner too, or are it."""
+    found = np.zeros(len(index), np.int64)
+    for i in range(len(index)):
+        for j in range(len(others)):
+            if (
+                abs(index[i, 0] - others[j, 0]) <= 1
+                and abs(index[i, 1] - others[j, 1]) <= 1
+                and abs(index[i, 2] - others[j, 2]) <= 1
+            ):
+                found[i] += 1
+    return found

@@ -13,7 +13,7 @@ STEP_M = 0.06
 
 
 def box(x, y, length, width, low, top, turned_rad=0.0):
-    """(N, 3) points on the upright sides and the top of a box: metres east, north of the tile's corner, and up."""
+    """(N, 3) points on the upright sides and the top of a box: metres east and north of the tile's corner, up."""
     u, v = np.arange(-length / 2, length / 2, STEP_M), np.arange(-width / 2, width / 2, STEP_M)
     z = np.arange(low, top, STEP_M)
     sides = [np.stack(np.meshgrid(u, [e], z), -1).reshape(-1, 3) for e in (-width / 2, width / 2)]
@@ -33,16 +33,16 @@ def car(x, y, turned_rad=0.0, *, ground_m=GROUND_M, length=4.4, top=1.5):
 def street(slope=0.0, level_m=GROUND_M):
     """(N, 3) points of the ground of the whole tile, that rises to the east."""
     x, y = np.meshgrid(np.arange(0.05, GRID.nx * GRID.dx_m, 0.1), np.arange(0.05, GRID.ny * GRID.dy_m, 0.1))
-    return np.stack([x, -y, level_m + slope * x], -1).reshape(-1, 3)
+    return np.stack([x, y, level_m + slope * x], -1).reshape(-1, 3)
 
 
 def gaussians(*points):
     """The Gaussians of points."""
     p = np.concatenate(points)
-    ix, iy, floor = np.floor(p[:, 0] / GRID.dx_m), np.floor(-p[:, 1] / GRID.dy_m), np.floor(p[:, 2])
+    ix, iy, floor = np.floor(p[:, 0] / GRID.dx_m), np.floor(p[:, 1] / GRID.dy_m), np.floor(p[:, 2])
     ids, at = np.unique(GRID.voxel_id(ix, iy, floor), return_inverse=True)
     n = np.bincount(at)
-    middle = np.stack([(ix + 0.5) * GRID.dx_m, -(iy + 0.5) * GRID.dy_m, floor + 0.5], axis=1)
+    middle = np.stack([(ix + 0.5) * GRID.dx_m, (iy + 0.5) * GRID.dy_m, floor + 0.5], axis=1)
     off = p - middle
     mean = np.stack([np.bincount(at, off[:, k]) / n for k in range(3)], axis=1)
     d = off - mean[at]
