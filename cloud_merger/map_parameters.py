@@ -51,6 +51,7 @@ from gnd.cloud_merger.shift import (
 )
 from gnd.gnd_map.config import from_mapping, to_mapping
 from gnd.gnd_map.errors import ConfigError
+from gnd.gnd_map.foliage import BOUNDS as SEASON_BOUNDS
 from gnd.gnd_map.settings import merged
 from gnd.gnd_map.vehicle_shape import BOUNDS
 from gnd.schemas.feature_layer import LayerParameters
@@ -84,6 +85,7 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
         "free_weight": PARKED_FREE_WEIGHT,
     },
     "vehicle_shape": BOUNDS,
+    "season": SEASON_BOUNDS,
     "shift": {
         "max_m": SHIFT_MAX_M,
         "max_rad": SHIFT_MAX_RAD,

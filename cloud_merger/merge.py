@@ -99,7 +99,7 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
 
 
 def plain_decisions(rows: Rows, epoch: Gaussians, parameters: MergeParameters) -> Found:
-    """What `decided` gives, over arrays of rows: for "paper" mode, and the twin of the kernel."""
+    """What `decided` gives, over arrays of rows: for the paper's modes, and the twin of the kernel."""
     of_statement = _joined(rows, _clusters(rows, parameters))
     winner = _winners(rows, of_statement, parameters)
     members, cluster = _members(rows, of_statement, winner)
@@ -130,8 +130,10 @@ def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
 
 
 def plain_clusters(rows: Rows, parameters: MergeParameters) -> Index:
-    """The same over arrays of all pairs: for "paper" mode, and the twin of `clusters_of`."""
+    """The same over arrays of all pairs: for the paper's modes, and the twin of `clusters_of`."""
     shown = rows["kind"] != Kind.WITHHELD
+    if parameters.mode == "paper-observers":
+        shown &= rows["claim"]  # uploads alone are clustered; who observed no change is no more than counted
     cluster = np.full(len(rows), -1, np.int64)
     cluster[shown] = _clusters_shown(rows[shown], parameters)
     return cluster
@@ -143,7 +145,7 @@ def _clusters_shown(rows: Rows, parameters: MergeParameters) -> Index:
     i, j = pairs_within(nodes["voxel_id"])
     there = (nodes["kind"][i] != Kind.NOTHING) & (nodes["kind"][j] != Kind.NOTHING)  # Eq. 14: else similarity 0
     i, j = i[there], j[there]
-    clustered = dbscan_sklearn if parameters.mode == "paper" else dbscan  # the paper names DBSCAN (GND 5.1)
+    clustered = dbscan_sklearn if parameters.has_paper_rules else dbscan  # the paper names DBSCAN (GND 5.1)
     label = clustered(
         np.bincount(node, minlength=len(first)).astype(np.int64),
         i,
@@ -213,7 +215,7 @@ def _similarity(a: Rows, b: Rows, parameters: MergeParameters) -> NDArray[np.flo
         b["count"] > 0,
         b["mean_m"],
         b["cov_m2"],
-        parameters.mode,
+        "paper" if parameters.has_paper_rules else "default",
         noise_m=np.sqrt(MERGE_NOISE_M**2 + a["pose_m2"] + b["pose_m2"]),
     )
 
@@ -221,7 +223,8 @@ def _similarity(a: Rows, b: Rows, parameters: MergeParameters) -> NDArray[np.flo
 def _winners(rows: Rows, cluster: Index, parameters: MergeParameters) -> Index:
     """GND 5.3: of each voxel the cluster with most statements, if it holds more than ξ of all. Sorted cluster numbers.
 
-    Of equally large clusters the one with the earliest report wins.
+    Of equally large clusters the one with the earliest report wins. "All" are the uploads as the paper prints it, else
+    all who observed the voxel: `rows` hold the ones or the others.
     """
     in_cluster = cluster >= 0
     number, first, member = np.unique(cluster[in_cluster], return_index=True, return_inverse=True)
@@ -259,7 +262,7 @@ def _representatives(rows: Rows, cluster: Index, parameters: MergeParameters) ->
     before: Index = np.cumsum(measured) - measured
     turn: Index = before - before[first][cluster]
     n = np.bincount(cluster, weights=measured).astype(np.int64)
-    if parameters.mode == "paper":
+    if parameters.has_paper_rules:
         use = measured.copy()
         use[first[n == 0]] = True
         return _recursive_moments(rows[use], cluster[use])
@@ -320,7 +323,7 @@ def _differs(
     Where most of its statements were compared with that very voxel and deny it, anything less than equal will do.
     """
     was = states_at(epoch, candidate["voxel_id"], Kind.QUOTED)
-    limit = np.where(denying > 0.5, MERGE_D_DENIED, MERGE_D_UPDATE)
+    limit = np.where((denying > 0.5) & (parameters.mode == "default"), MERGE_D_DENIED, MERGE_D_UPDATE)
     return np.asarray(_similarity(was, candidate, parameters) < limit)
 
 

@@ -27,7 +27,10 @@ from gnd.schemas.course import Course
 if TYPE_CHECKING:
     from gnd.cloud_merger.memory import TileMemory
 
-Mode = Literal["paper", "default"]
+Mode = Literal["paper", "paper-observers", "default"]
+"""Rules of the merge. The GND paper's rules with the two readings of the ratio that ξ_update bounds (5.3, "the ratio of
+the number of merged voxels to the number of information uploads"): "paper" as printed, of all uploads about the voxel;
+"paper-observers" with the observers as denominator, of all vehicles that observed it, the silent ones too."""
 EPOCH = 1  # the number of the epoch's own Gaussian among the states of a voxel
 REMEMBERED: Final = 2048
 NO_BASE = b""  # hash in the report of a vehicle that had no map of the tile
@@ -151,11 +154,11 @@ def statements_of(
         epoch: the tile that all reports of this window are merged into.
         reports: in any order; of a report id that comes again the last one counts.
         bases: Gaussians of the tile's versions by hash. Of an unknown base, "as in base version" abstains.
-        mode: "paper" takes the uploaded changes only; "default" every observed voxel.
+        mode: "paper" takes the uploaded changes only; the others every observed voxel.
         memory: of the windows before; None: there are none.
     """
     ordered = sorted({report.report_id: report for report in reports}.values(), key=lambda r: r.report_id)
-    known = {NO_BASE: Gaussians.empty(), **bases} if mode == "default" else {}
+    known = {} if mode == "paper" else {NO_BASE: Gaussians.empty(), **bases}
     claims = np.zeros(0, STATEMENT) if memory is None else memory.claims_beside(ordered)
     voxels = _disputed(epoch, ordered, known)
     if len(claims):

@@ -25,6 +25,7 @@ from gnd.cloud_merger.memory import (
 )
 from gnd.cloud_merger.merge import MergedTile, MergeParameters, merge_tile
 from gnd.cloud_merger.parked import hold_parked, parked_after
+from gnd.cloud_merger.season import hold_season
 from gnd.cloud_merger.snapping import Snapping
 from gnd.cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness, find, statements_of
 from gnd.gnd_map.codec import Lattice, snap
@@ -94,9 +95,9 @@ class WindowMerger:
         `lattice`: on which the tile lies; None: none.
         """
         rules, named = self.rules, self.named
-        if rules.mode == "paper":  # it knows neither shift tests nor a gate nor a memory
+        if rules.has_paper_rules:  # they know neither shift tests nor a gate nor a memory
             in_play = Believed(tuple(reports), (), ())
-            statements = statements_of(state.gaussians, reports, self.bases, "paper")
+            statements = statements_of(state.gaussians, reports, self.bases, rules.mode)
             gated, parked = GatedTile(merge_tile(state.gaussians, statements, rules)), state.memory.parked
         else:
             shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
@@ -105,9 +106,10 @@ class WindowMerger:
             merged = merge_tile(state.gaussians, statements, rules)
             by, seen = statements.witnesses, in_play.reports
             standing = state.memory.parked, self.bases, self.confirmation.parked_h
-            free = hold_parked(state.gaussians, merged, seen, *standing)
+            bare, leaves = hold_season(state.gaussians, merged, seen)
+            free = hold_parked(state.gaussians, bare, seen, *standing)
             found = gate(state.gaussians, free.merged, seen, self.confirmation, named, witnesses=by)
-            gated = GatedTile(found.merged, (*found.waiting, *free.waiting, *in_play.set_aside))
+            gated = GatedTile(found.merged, (*found.waiting, *free.waiting, *leaves, *in_play.set_aside))
             parked = free.voxels
         gaussians = self._on_lattice(gated.merged, reports, lattice)
         return MergedWindow(in_play, statements, gated, gaussians, parked, self.bases)

@@ -256,7 +256,7 @@ def test_any_batching_ends_in_the_same_tile_bit_for_bit(tmp_path_factory, some, 
     assert head_after(folder / "one.sqlite", reports, [])[0] == head_after(folder / "many.sqlite", shuffled, cuts)[0]
 
 
-@pytest.mark.parametrize("mode", ["default", "paper"])
+@pytest.mark.parametrize("mode", ["default", "paper", "paper-observers"])
 def test_a_batch_after_publication_ends_as_if_it_had_come_at_once(tmp_path, mode):
     reports = [
         report_of(n, change_of(EPOCH, [0, 1, 2], {1: WALL_AGAIN, 2: state}))

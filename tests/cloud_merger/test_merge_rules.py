@@ -68,6 +68,32 @@ def test_observers_who_saw_no_change_outvote_one_parked_car():
     sees_none = change_of(EPOCH, [0, 1, 2], {})
     assert merged([sees_car, sees_none, sees_none]).gaussians == EPOCH
     assert merged([sees_car, sees_none, sees_none], mode="paper").changed.tolist() == [2]  # counts uploads only
+    assert merged([sees_car, sees_none, sees_none], mode="paper-observers").gaussians == EPOCH
+
+
+def test_the_readings_of_xi_differ_in_the_denominator_alone():
+    """ξ = 0.6 of what: of the uploads about the voxel, or of the vehicles that observed it."""
+    change, none = change_of(EPOCH, [0, 1, 2], {2: BALL}), change_of(EPOCH, [0, 1, 2], {})
+    elsewhere = change_of(EPOCH, [0], {})
+    for silent, observers_publish in ((1, True), (2, False)):  # 3 of 4 are more than 0.6; 3 of 5 are not
+        reports = [change] * 3 + [none] * silent + [elsewhere] * 3
+        assert merged(reports, mode="paper").changed.tolist() == [2]
+        read = merged(reports, mode="paper-observers")
+        assert read.changed.tolist() == ([2] if observers_publish else [])
+    for mode in ("paper", "paper-observers"):  # all who observed it uploaded it: nothing is left to differ
+        alike = merged([change] * 3 + [elsewhere] * 2, mode=mode).gaussians
+        assert alike == merged([change] * 3, mode="paper").gaussians
+
+
+def test_silent_observers_neither_join_a_cluster_nor_move_its_representative():
+    """Four uploads that say "gone" and one silent vehicle: the Gaussian is removed; what the fifth saw is no upload."""
+    gone = change_of(EPOCH, [0, 1], {1: None}, change_class=ChangeClass.DELETED)
+    silent = change_of(EPOCH, [0, 1], {})
+    assert merged([gone] * 4 + [silent], mode="paper-observers").changed.tolist() == [1]
+    assert merged([gone] * 3 + [silent] * 2, mode="paper-observers").gaussians == EPOCH
+    again = change_of(EPOCH, [0, 1], {1: BALL})
+    whole, part = (merged([again] * 4 + [silent] * n, mode="paper-observers").gaussians for n in (0, 2))
+    assert part == whole != EPOCH
 
 
 def test_who_did_not_observe_the_voxel_has_no_vote():
