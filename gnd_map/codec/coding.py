@@ -19,35 +19,43 @@ State = tuple[I64, npt.NDArray[np.uint8], I32, I64]
 
 @dataclass(slots=True)
 class Coder:
-    """One stream, being written or read. `state` is what the kernels take; `volume`: voxels of its boxes so far."""
+    """One stream, being written or read.
+
+    Attributes:
+        state: what the kernels take.
+        volume: voxels of its boxes so far.
+        five: whether the numbers of voxels are coded in five contexts, else in three.
+    """
 
     state: State
     volume: int = 0
+    five: bool = False
 
     @classmethod
-    def writing(cls, priors: Priors, room: int) -> "Coder":
+    def writing(cls, priors: Priors, room: int, *, five: bool = False) -> "Coder":
         """A stream to write, with room for so many bytes."""
         coder = np.zeros(k.SLOTS, np.int64)
         coder[k.HIGH] = 0xFFFFFFFF
-        return cls((coder, np.zeros(room, np.uint8), *priors.copies()))
+        return cls((coder, np.zeros(room, np.uint8), *priors.copies()), five=five)
 
     @classmethod
-    def reading(cls, priors: Priors, body: bytes) -> "Coder":
-        """A stream to read: `finish` of another coder.
+    def reading(cls, priors: Priors, body: bytes, head_bytes: int = 0, *, five: bool = False) -> "Coder":
+        """A stream to read: `finish` of another coder, with a head of so many bytes.
 
         Raises:
             CodecError: too short, or its checksum is wrong.
         """
-        if len(body) < CHECK_BYTES:
-            raise CodecError(f"{len(body)} bytes, fewer than the {CHECK_BYTES} of the checksum")
+        if len(body) < head_bytes + CHECK_BYTES:
+            raise CodecError(f"{len(body)} bytes, fewer than the {head_bytes + CHECK_BYTES} of head and checksum")
         data, check = body[:-CHECK_BYTES], body[-CHECK_BYTES:]
         if checksum(data) != check:
             raise CodecError(f"{len(body)} bytes with checksum {check.hex()}, computed {checksum(data).hex()}: damaged")
+        data = data[head_bytes:]
         coder = np.zeros(k.SLOTS, np.int64)
         coder[k.HIGH], coder[k.MODE], coder[k.AT] = 0xFFFFFFFF, 1, 4
         coder[k.CODE] = int.from_bytes(data[:4].ljust(4, b"\0"), "big")
         coder[k.OVERRUN] = max(0, 4 - len(data))
-        return cls((coder, np.frombuffer(data, np.uint8).copy(), *priors.copies()))
+        return cls((coder, np.frombuffer(data, np.uint8).copy(), *priors.copies()), five=five)
 
     def check(self) -> None:
         """`CodecError` when the kernels have met what cannot be."""
@@ -62,17 +70,21 @@ class Coder:
         self.check()
         return found
 
+    def spent_bytes(self) -> tuple[float, ...]:
+        """Bytes of each field of a stream that counts them, see `kernels.FIELD`; its few last bits are nobody's."""
+        return tuple((self.state[0][k.SPENT :] / (8 << 16)).tolist())
+
     def bit(self, at: int, value: int | bool = 0) -> int:
         """Write a decision, or read one."""
         found = int(k.code_bit(self.state, at, int(value)))
         self.check()
         return found
 
-    def finish(self) -> bytes:
-        """The bytes written: as few as tell the last interval, then the checksum."""
+    def finish(self, head: bytes = b"") -> bytes:
+        """The head, the bytes written, as few as tell the last interval, and the checksum of both."""
         self.check()
         coder, buffer = self.state[0], self.state[1]
-        data = buffer[: coder[k.AT]].tobytes() + _shortest(int(coder[k.LOW]), int(coder[k.HIGH]))
+        data = head + buffer[: coder[k.AT]].tobytes() + _shortest(int(coder[k.LOW]), int(coder[k.HIGH]))
         return data + checksum(data)
 
     def end(self) -> None:

@@ -17,6 +17,7 @@ from gnd.gnd_map.arrays import I64
 from gnd.gnd_map.jit import bare, bare_inlined
 
 U8 = NDArray[np.uint8]
+Five = tuple[int, int, int, int, int]
 State = Any  # (coder, buffer, places, weight): arrays, see `coding.Coder`; a place is probability << 8 | times seen
 
 # Slots of `coder` (int64).
@@ -24,10 +25,13 @@ LOW: Final = 0
 HIGH: Final = 1
 CODE: Final = 2
 AT: Final = 3
-MODE: Final = 4  # 0 writes, 1 reads
+MODE: Final = 4  # 0 writes, 1 reads, 2 writes and counts
 OVERRUN: Final = 5
 TROUBLE: Final = 6
-SLOTS: Final = 7
+FIELD: Final = 7  # which field is coded: 0 voxels, 1 axis, 2 … the numbers
+SPENT: Final = 8  # bits of each field, 2^-16; only where they are counted
+FIELDS: Final = 12
+SLOTS: Final = SPENT + FIELDS
 FULL: Final = 1
 TOO_SHORT: Final = 2
 TOO_LARGE: Final = 3
@@ -63,13 +67,15 @@ _STRETCH: Final = _stretch_table().astype(np.int16)
 _STEP: Final = np.array([2 * _ONE // (2 * n + 3) for n in range(256)], np.int64)
 _LIMIT: Final = 250
 _MIX_RATE: Final = 6
+_COST: Final = np.round(-_ONE * np.log2(np.maximum(np.arange(4097), 0.5) / 4096)).astype(np.int64)
+"""Bits of a decision, 2^-16, by its probability of 12 bits: for measures only, no byte depends on it."""
 
 
 @bare
 def _shift_out(coder: I64, buffer: U8) -> None:
     """Move the bytes on which both ends of the interval agree."""
     while ((coder[LOW] ^ coder[HIGH]) & 0xFF000000) == 0:
-        if coder[MODE] == 0:
+        if coder[MODE] != 1:
             if coder[AT] >= len(buffer):
                 coder[TROUBLE] = FULL
                 coder[AT] = 0
@@ -96,6 +102,8 @@ def _code(coder: I64, buffer: U8, p: int, bit: int) -> int:
     middle = coder[LOW] + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
     if coder[MODE] == 1:
         bit = 1 if coder[CODE] <= middle else 0
+    elif coder[MODE] == 2:
+        coder[SPENT + coder[FIELD]] += _COST[(p if bit == 1 else _ONE - p) >> 4]
     if bit == 1:
         coder[HIGH] = middle
     else:
@@ -141,6 +149,28 @@ def code_mixed(state: State, a: int, b: int, c: int, w: int, bit: int) -> int:
     return bit
 
 
+@bare
+def code_mixed_5(state: State, at: Five, w: int, bit: int) -> int:
+    """One decision in five contexts, mixed by the weights at `w`."""
+    coder, buffer, places, weight = state
+    a, b, c, d, e = at
+    pa, pb, pc, pd, pe = places[a], places[b], places[c], places[d], places[e]
+    sa, sb, sc = np.int64(_STRETCH[pa >> 12]), np.int64(_STRETCH[pb >> 12]), np.int64(_STRETCH[pc >> 12])
+    sd, se = np.int64(_STRETCH[pd >> 12]), np.int64(_STRETCH[pe >> 12])
+    dot = weight[w, 0] * sa + weight[w, 1] * sb + weight[w, 2] * sc + weight[w, 3] * sd + weight[w, 4] * se
+    p = np.int64(_SQUASH[min(max(dot >> 16, -2047), 2047) + 2048])
+    bit = _code(coder, buffer, p, bit)  # type: ignore[arg-type]  # an int64 to numba
+    error = ((bit << 16) - p) * _MIX_RATE
+    weight[w, 0] += (sa * error + 0x80000) >> 20
+    weight[w, 1] += (sb * error + 0x80000) >> 20
+    weight[w, 2] += (sc * error + 0x80000) >> 20
+    weight[w, 3] += (sd * error + 0x80000) >> 20
+    weight[w, 4] += (se * error + 0x80000) >> 20
+    places[a], places[b], places[c] = _learnt(pa, bit), _learnt(pb, bit), _learnt(pc, bit)
+    places[d], places[e] = _learnt(pd, bit), _learnt(pe, bit)
+    return bit
+
+
 WIDTH: Final = 25
 """Contexts of one number: 14 for its length in bits, one for its sign, the rest for its leading digits."""
 _SIGN: Final = 14
@@ -165,6 +195,28 @@ def code_signed(state: State, a: int, b: int, c: int, w: int, value: int) -> int
     for i in range(k - 2, -1, -1):
         lead = _LEAD + (min(k, 6) - 2 if i == k - 2 else (min(k, 6) + 2 if i == k - 3 else 9))
         found = found << 1 | code_mixed(state, a + lead, b + lead, c + lead, w + lead, (size >> i) & 1)
+    return -found if sign == 1 else found
+
+
+@bare
+def code_signed_5(state: State, at: Five, w: int, value: int) -> int:
+    """`code_signed` in five contexts."""
+    a, b, c, d, e = at
+    size = abs(value)
+    length = 0
+    while (size >> length) > 0:
+        length += 1
+    k = 0
+    while k < _LONGEST and code_mixed_5(state, (a + k, b + k, c + k, d + k, e + k), w + k, 1 if length > k else 0) == 1:
+        k += 1
+    if k == 0:
+        return 0
+    i = _SIGN
+    sign = code_mixed_5(state, (a + i, b + i, c + i, d + i, e + i), w + i, 1 if value < 0 else 0)
+    found = 1
+    for j in range(k - 2, -1, -1):
+        i = _LEAD + (min(k, 6) - 2 if j == k - 2 else (min(k, 6) + 2 if j == k - 3 else 9))
+        found = found << 1 | code_mixed_5(state, (a + i, b + i, c + i, d + i, e + i), w + i, (size >> j) & 1)
     return -found if sign == 1 else found
 
 

@@ -44,6 +44,8 @@ COUNTS: Final = (*_FEW, *(CELLS << j for j in range(27)))
 """Numbers of points on a lattice: one an octave,"""
 ROUGH_COUNTS: Final = (*_FEW, *(CELLS << j for j in range(0, 27, 3)))
 """or one in three."""
+MAP_COUNTS: Final = (*_FEW, *(CELLS << j for j in range(0, 27, 2)))
+"""Those of a new *standard* map, one in two: with one in three, NDT on cells of 2 m feels the rounding."""
 
 AXES: Final = np.array([[1, 2, 0], [0, 2, 1], [0, 1, 2]])
 """Axes (a, b, c) by the axis c along which the Gaussian is thinnest."""
@@ -64,6 +66,7 @@ class Lattice:
         thin_bits: the whitened mean's last component is a multiple of 2^-thin_bits.
         plane_bits: its other two are multiples of 2^-plane_bits.
         counts: numbers of points, increasing.
+        map_counts: those of `counts` to which the Gaussians of a new map are rounded; none given: all.
     """
 
     name: str
@@ -75,6 +78,7 @@ class Lattice:
     thin_bits: int
     plane_bits: int
     counts: tuple[int, ...] = COUNTS
+    map_counts: tuple[int, ...] = ()
 
     @property
     def length_bits(self) -> int:
@@ -93,7 +97,7 @@ def _levels(first_m: float, ratio: float) -> tuple[int, ...]:
 
 
 ARCHIVE: Final = Lattice("archive", 0, _levels(0.002, 1.15), 1, 3, 3, 3, 4)
-STANDARD: Final = Lattice("standard", 1, _levels(0.004, 1.2), 2, 2, 1, 2, 3)
+STANDARD: Final = Lattice("standard", 1, _levels(0.004, 1.2), 2, 2, 1, 2, 3, map_counts=MAP_COUNTS)
 COMPACT: Final = Lattice("compact", 2, _levels(0.004, 1.3), 2, 1, 0, 1, 2, ROUGH_COUNTS)
 REPORT: Final = Lattice("report", 3, _levels(0.004, 1.3), 2, 1, 0, 1, 1)
 """For what one vehicle measured, which the merger averages: half of a standard deviation does."""
@@ -190,8 +194,15 @@ def _floats(quantised: Quantised, lattice: Lattice) -> tuple[F32, F32]:
     return mean_m, cov_m2
 
 
-def snap(gaussians: Gaussians, lattice: Lattice) -> Gaussians:
-    """The Gaussians moved onto the lattice; what lies on it, and "nothing here" (count 0), stays to the bit."""
+def snap(gaussians: Gaussians, lattice: Lattice, *, new_map: bool = False) -> Gaussians:
+    """The Gaussians moved onto the lattice; what lies on it, and "nothing here" (count 0), stays to the bit.
+
+    Args:
+        gaussians: of one tile.
+        lattice: where to.
+        new_map: of a map that is built: numbers of points become coarser, which nothing that reads a map feels. What is
+            merged into a map keeps the finer ones: a merge must give the same bits whenever it is computed anew.
+    """
     there = gaussians.exists
     if not there.any():
         return gaussians
@@ -199,7 +210,10 @@ def snap(gaussians: Gaussians, lattice: Lattice) -> Gaussians:
     off = np.flatnonzero(~_found(some, lattice)[1])
     if len(off) == 0:
         return gaussians
-    moved = dequantise(_readable(some.take(off), lattice), lattice)
+    integers = _readable(some.take(off), lattice)
+    if new_map and lattice.map_counts:
+        integers.count[:] = _coarser(some.count[off], lattice)
+    moved = dequantise(integers, lattice)
     kept = np.delete(np.arange(len(gaussians)), np.flatnonzero(there)[off])
     return concat([gaussians.take(kept), moved])
 
@@ -428,12 +442,18 @@ def _with_means(gaussians: Gaussians, axis: I32, level: I32, slope: I32, lattice
 
 def _count_index(count: I32, lattice: Lattice) -> I32:
     """Nearest number of points on the lattice; what suffices for a Gaussian (20) still does."""
-    return np.searchsorted(_between(lattice), count).astype(np.int32)
+    return np.searchsorted(_between(lattice.counts), count).astype(np.int32)
 
 
-def _between(lattice: Lattice) -> F64:
+def _coarser(count: I32, lattice: Lattice) -> I32:
+    """Of the nearest number of points of a new map."""
+    kept = np.array(lattice.map_counts)[np.searchsorted(_between(lattice.map_counts), count)]
+    return np.searchsorted(lattice.counts, kept).astype(np.int32)
+
+
+def _between(numbers: tuple[int, ...]) -> F64:
     """Where the nearest number of points changes."""
-    counts = np.array(lattice.counts, np.float64)
+    counts = np.array(numbers, np.float64)
     between = np.sqrt(counts[1:] * counts[:-1])
     between[counts[1:] == CELLS] = CELLS - 0.5
     return np.asarray(between)
@@ -447,7 +467,7 @@ def _numbers(lattice: Lattice) -> tuple[I64, I64, F64]:
     n[k.THIN_BITS], n[k.PLANE_BITS] = lattice.thin_bits, lattice.plane_bits
     n[k.LENGTH_BITS], n[k.MEAN_BITS] = lattice.length_bits, lattice.mean_bits
     n[k.CELLS_AT], n[k.LONGEST] = CELLS, MAX_LENGTH_M << lattice.length_bits
-    return n, np.array(lattice.counts, np.int64), _between(lattice)
+    return n, np.array(lattice.counts, np.int64), _between(lattice.counts)
 
 
 _PROBE: Final = 8

@@ -17,7 +17,12 @@ import numpy as np
 
 from gnd.gnd_map.arrays import I32, I64
 from gnd.gnd_map.codec import kernels as k
-from gnd.gnd_map.codec.voxel_kernels import VOXEL_CONTEXTS, VOXEL_WEIGHTS
+from gnd.gnd_map.codec.voxel_kernels import (
+    MORE_VOXEL_CONTEXTS,
+    MORE_VOXEL_WEIGHTS,
+    VOXEL_CONTEXTS,
+    VOXEL_WEIGHTS,
+)
 
 _PLAIN: Final = 70
 FLAG_CONTEXTS: Final = k.BLOCK_CONTEXTS + k.CELL_CONTEXTS + k.KIND_CONTEXTS
@@ -33,6 +38,7 @@ VOXEL_WEIGHTS_AT: Final = FLAG_WEIGHTS
 WEIGHTS: Final = FLAG_WEIGHTS + VOXEL_WEIGHTS
 
 _FIRST_WEIGHT: Final = 24_000
+_FIRST_WEIGHT_OF_5: Final = 16_000
 
 
 def number_at(which: int) -> int:
@@ -65,9 +71,21 @@ class Priors:
             np.full((WEIGHTS, 3), _FIRST_WEIGHT, np.int64),
         )
 
+    @classmethod
+    def flat_5(cls) -> "Priors":
+        """The same of a stream that mixes five contexts."""
+        weight = np.full((WEIGHTS + MORE_VOXEL_WEIGHTS, 5), _FIRST_WEIGHT_OF_5, np.int64)
+        weight[: VOXEL_WEIGHTS_AT + 2] = [_FIRST_WEIGHT] * 3 + [0, 0]
+        return cls(np.full(CONTEXTS + MORE_VOXEL_CONTEXTS, 1 << 23, np.int32), weight)
+
     def copies(self) -> tuple[I32, I64]:
         """Arrays for a stream to learn in."""
         return self.places.copy(), self.weight.copy()
+
+    def frozen(self, trust: int) -> "Priors":
+        """The same, to count as at most `trust` decisions."""
+        seen = np.minimum(self.places & 0xFF, trust)
+        return Priors((self.places >> 8 << 8 | seen).astype(np.int32), self.weight.copy())
 
 
 STREAMS: Final = (
@@ -98,11 +116,6 @@ class Learning(Priors):
     def copies(self) -> tuple[I32, I64]:
         """The arrays themselves."""
         return self.places, self.weight
-
-    def frozen(self, trust: int) -> Priors:
-        """What was learnt, to count as at most `trust` decisions."""
-        seen = np.minimum(self.places & 0xFF, trust)
-        return Priors((self.places >> 8 << 8 | seen).astype(np.int32), self.weight.copy())
 
 
 @contextmanager

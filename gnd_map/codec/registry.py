@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from gnd.gnd_map.codec.floats import CODEC_FLOAT32, decode_gaussians, encode_gaussians
 from gnd.gnd_map.codec.lattice import ARCHIVE, COMPACT, STANDARD, Lattice, is_on
-from gnd.gnd_map.codec.range_tile import decode_tile, encode_tile
+from gnd.gnd_map.codec.range_tile import decode_tile, decode_tile_by_set, encode_tile, encode_tile_by_set
 from gnd.gnd_map.codec.zstd_columns import (
     decode_float_columns,
     decode_lattice_columns,
@@ -20,6 +20,7 @@ from gnd.gnd_map.tile_id import TileId
 CODEC_FLOAT32_ZSTD = 1
 CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT = 2, 3, 4
 CODEC_ARCHIVE_ZSTD, CODEC_STANDARD_ZSTD, CODEC_COMPACT_ZSTD = 5, 6, 7
+CODEC_ARCHIVE_SETS, CODEC_STANDARD_SETS, CODEC_COMPACT_SETS = 8, 9, 10
 
 Encode = Callable[[TileId, Gaussians], bytes]
 Decode = Callable[[TileId, bytes], Gaussians]
@@ -51,6 +52,16 @@ def _range_codec(codec_id: int, lattice: Lattice) -> Codec:
     return Codec(codec_id, f"{lattice.name}, range coded", encode, decode, lattice)
 
 
+def _sets_codec(codec_id: int, lattice: Lattice) -> Codec:
+    def encode(tile_id: TileId, gaussians: Gaussians) -> bytes:
+        return encode_tile_by_set(tile_id, gaussians, lattice)
+
+    def decode(tile_id: TileId, body: bytes) -> Gaussians:
+        return decode_tile_by_set(tile_id, body, lattice)
+
+    return Codec(codec_id, f"{lattice.name}, range coded by sets", encode, decode, lattice)
+
+
 def _zstd_codec(codec_id: int, lattice: Lattice) -> Codec:
     def encode(tile_id: TileId, gaussians: Gaussians) -> bytes:
         return encode_lattice_columns(codec_id, lattice, tile_id, gaussians)
@@ -70,10 +81,18 @@ _ALL = (
     _zstd_codec(CODEC_ARCHIVE_ZSTD, ARCHIVE),
     _zstd_codec(CODEC_STANDARD_ZSTD, STANDARD),
     _zstd_codec(CODEC_COMPACT_ZSTD, COMPACT),
+    _sets_codec(CODEC_ARCHIVE_SETS, ARCHIVE),
+    _sets_codec(CODEC_STANDARD_SETS, STANDARD),
+    _sets_codec(CODEC_COMPACT_SETS, COMPACT),
 )
 CODECS: Mapping[int, Codec] = MappingProxyType({codec.codec_id: codec for codec in _ALL})
-PREFERRED = tuple(sorted(CODECS, key=lambda i: (i not in (CODEC_COMPACT, CODEC_STANDARD, CODEC_ARCHIVE), -i)))
+_ZSTD = (CODEC_COMPACT_ZSTD, CODEC_STANDARD_ZSTD, CODEC_ARCHIVE_ZSTD, CODEC_FLOAT32_ZSTD)
+PREFERRED = tuple(sorted(CODECS, key=lambda i: (i == CODEC_FLOAT32 or i in _ZSTD, -i)))
 """All ids that this program reads, smallest bodies first."""
+RANGE_CODECS = (
+    CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT, CODEC_ARCHIVE_SETS, CODEC_STANDARD_SETS, CODEC_COMPACT_SETS
+)  # fmt: skip
+"""Who reads one of these reads the deltas of its lattice, which are coded in the same way."""
 
 
 def codec_of(codec_id: int) -> Codec:

@@ -218,4 +218,5 @@ def _coding(
         lattice.length_bits,
         lattice.mean_bits,
         int(has_base),
+        int(coder.five),
     )

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from gnd.gnd_map.arrays import I32, I64
-from gnd.gnd_map.codec.kernels import TROUBLE, WIDTH, code_mixed, code_signed
+from gnd.gnd_map.codec.kernels import FIELD, TROUBLE, WIDTH, code_mixed, code_signed, code_signed_5
 from gnd.gnd_map.jit import bare, bare_inlined
 
 # Gaussians: columns of a table of int32, one row a voxel.
@@ -43,16 +43,34 @@ _FAMILIES: Final = (
 )
 
 
-def _starts() -> I64:
-    sizes = [n * WIDTH for family in _FAMILIES for n in family]
+_MORE: Final = (
+    (175, 128),  # level c: what two neighbours say; the six across faces
+    (200, 64),  # level a: the second neighbour, who is beside it, how odd level a was; the six
+    (200, 64),  # level b
+    (175, 128),  # count: as level c
+    (25, 64),  # shear: that of two neighbours; the six
+    (117, 108),  # slope cb: what the nearest alone says; how steep it is expected to be
+    (117, 108),  # slope ca
+    (64, 52),  # step a: the six; that of the nearest
+    (64, 52),  # step b
+    (156, 324),  # step c: an evenly changing tilt, doubt, the nearest; where in the voxel it is expected
+)
+"""Two contexts more of each, in the codecs that mix five."""
+
+
+def _starts(families: tuple[tuple[int, ...], ...]) -> I64:
+    sizes = [n * WIDTH for family in families for n in family]
     return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
 
-_START: Final = _starts()
+_START: Final = _starts(_FAMILIES)
+_MORE_START: Final = _starts(_MORE)
 AXIS_CONTEXTS: Final = 2 * (16 + 64 + 12)
 NUMBER_CONTEXTS: Final = int(_START[-1])
 VOXEL_CONTEXTS: Final = AXIS_CONTEXTS + NUMBER_CONTEXTS
 VOXEL_WEIGHTS: Final = 2 + WIDTH * len(_FAMILIES)
+MORE_VOXEL_CONTEXTS: Final = int(_MORE_START[-1])
+MORE_VOXEL_WEIGHTS: Final = 3 * WIDTH * len(_FAMILIES)
 
 MOST_REFS: Final = 4
 _BITS: Final = 16
@@ -81,6 +99,7 @@ class VoxelCoding(NamedTuple):
         length_bits: fraction of D, m.
         mean_bits: fraction of heights and of the mean, m.
         has_base: 1 where both sides hold Gaussians of the tile, else 0.
+        five: 1 where numbers are coded in five contexts, 0 where in three.
     """
 
     state: Any
@@ -99,6 +118,7 @@ class VoxelCoding(NamedTuple):
     length_bits: int
     mean_bits: int
     has_base: int
+    five: int
 
 
 class _Voxel(NamedTuple):
@@ -112,6 +132,9 @@ class _Voxel(NamedTuple):
         first: row of the first of them; 0, the typical values, where there is none.
         around_a: which of the two neighbours along a hold a Gaussian, or will, two bits.
         around_b: likewise along b.
+        around_c: likewise along c.
+        occupied: all six of them.
+        second: row of the second known neighbour of the same axis; that of the first where there is one, else 0.
     """
 
     row: int
@@ -121,6 +144,9 @@ class _Voxel(NamedTuple):
     first: int
     around_a: int
     around_b: int
+    around_c: int
+    occupied: int
+    second: int
 
 
 @bare
@@ -146,7 +172,10 @@ def _code_voxel(m: VoxelCoding, row: int) -> None:
     n = _neighbours(m, row, axis, MOST_REFS)
     first = m.refs[0] if n > 0 else 0
     along_a, along_b = (0 if axis != 0 else 1), (2 if axis != 2 else 1)
-    v = _Voxel(row, kind, axis, n, first, occupied >> (2 * along_a) & 3, occupied >> (2 * along_b) & 3)
+    v = _Voxel(
+        row, kind, axis, n, first, occupied >> (2 * along_a) & 3, occupied >> (2 * along_b) & 3,
+        occupied >> (2 * axis) & 3, occupied, m.refs[1] if n > 1 else first,
+    )  # fmt: skip
     _code_sizes(m, v)
     odd_a, odd_b = _code_slopes(m, v)
     _code_mean(m, v, min(_bucket(odd_a), 3) * 4 + min(_bucket(odd_b), 3))
@@ -157,6 +186,7 @@ def _code_voxel(m: VoxelCoding, row: int) -> None:
 def _code_axis(m: VoxelCoding, row: int, occupied: int, kind: int) -> int:
     """The axis along which the Gaussian is thinnest."""
     table, refs = m.table, m.refs
+    m.state[0][FIELD] = 1
     n = _neighbours(m, row, _ANY_AXIS, 2)
     first = table[refs[0], AXIS] if n > 0 else _NO_AXIS
     second = table[refs[1], AXIS] if n > 1 else _NO_AXIS
@@ -183,12 +213,18 @@ def _code_sizes(m: VoxelCoding, v: _Voxel) -> None:
     known = min(v.n, 3) * 3 + v.kind
     spread = min(high_c - low_c, 5) if v.n > 1 else 0
 
-    odd_c = _number(m, _LEVEL_C, known, _clip(mean_c // 2, 0, 23), spread * 3 + v.axis, table[row, LEVEL + 2] - mean_c)
+    one, two = table[v.first, LEVEL + 2] - mean_c, table[v.second, LEVEL + 2] - mean_c
+    d, e = _two_neighbours(v, one, two), v.occupied * 2 + (v.n > 0)
+    odd_c = _number(
+        m, v, _LEVEL_C, known, _clip(mean_c // 2, 0, 23), spread * 3 + v.axis, d, e, table[row, LEVEL + 2] - mean_c
+    )
     level_c = table[row, LEVEL + 2] = _clip(mean_c + odd_c, 0, top)
     level_a = _code_level(m, v, 0, _LEVEL_A, v.around_a, min(level_c // 2, 15))
     level_b = _code_level(m, v, 1, _LEVEL_B, v.around_b, min(level_a, 15))
+    one, two = table[v.first, COUNT] - mean_count, table[v.second, COUNT] - mean_count
+    d, e = _two_neighbours(v, one, two), v.occupied * 2 + (v.n > 0)
     odd_count = _number(
-        m, _COUNT, known, _clip(mean_count, 0, 23), min(level_a + level_b, 23), table[row, COUNT] - mean_count
+        m, v, _COUNT, known, _clip(mean_count, 0, 23), min(level_a + level_b, 23), d, e, table[row, COUNT] - mean_count
     )
     table[row, COUNT] = _clip(mean_count + odd_count, 0, 30)
 
@@ -198,7 +234,12 @@ def _code_level(m: VoxelCoding, v: _Voxel, which: int, family: int, around: int,
     """A standard deviation along the surface."""
     want = m.table[v.first, LEVEL + which]
     contexts = min(want, 15), (around * 3 + v.axis) * 3 + v.kind, other
-    odd = _number(m, family, contexts[0], contexts[1], contexts[2], m.table[v.row, LEVEL + which] - want)
+    odd_b = _clip(m.table[v.row, LEVEL] - m.table[v.first, LEVEL], -2, 2) + 2 if which == 1 else 2
+    second = _clip(m.table[v.second, LEVEL + which] - want, -2, 2) + 2
+    d = ((odd_b * 2 + (v.n > 0)) * 4 + around) * 5 + second
+    odd = _number(
+        m, v, family, contexts[0], contexts[1], contexts[2], d, v.occupied, m.table[v.row, LEVEL + which] - want
+    )
     found = _clip(want + odd, 0, (len(m.sd) - 1) // m.plane_step)
     m.table[v.row, LEVEL + which] = found
     return found
@@ -212,9 +253,11 @@ def _code_slopes(m: VoxelCoding, v: _Voxel) -> tuple[int, int]:
     table, row = m.table, v.row
     level_a, level_b, level_c = table[row, LEVEL], table[row, LEVEL + 1], table[row, LEVEL + 2]
     near_shear = _bucket(table[v.first, SLOPE]) if v.n > 0 else 0
+    d = (_clip(table[v.first, SLOPE], -2, 2) + 2) * 5 + _clip(table[v.second, SLOPE], -2, 2) + 2 if v.n > 0 else 12
     s_ba = table[row, SLOPE] = _number(
-        m, _SHEAR, min(near_shear, 4) * 3 + v.kind, min(level_a, 15), min(level_b, 15), table[row, SLOPE]
-    )
+        m, v, _SHEAR, min(near_shear, 4) * 3 + v.kind, min(level_a, 15), min(level_b, 15), d, v.occupied,
+        table[row, SLOPE],
+    )  # fmt: skip
     D1, D2, D3 = _diagonal(m, row)
     L21 = s_ba * D2 >> m.shear_bits
 
@@ -232,10 +275,18 @@ def _code_slopes(m: VoxelCoding, v: _Voxel) -> tuple[int, int]:
 
     near, thin, turned = min(v.n, 3) * 6, _clip(level_c, 0, 23), (v.kind * 3 + v.axis) * 4
     want = _clip(_ratio((tilt_b * D2 >> _BITS) << m.slope_bits, D3), -2000, 2000)
-    odd_b = _number(m, _SLOPE_CB, near + doubt_b, thin, turned + min(_bucket(s_ba), 3), table[row, SLOPE + 2] - want)
+    first = _clip(_ratio((int(table[v.first, TILT + 1]) * D2 >> _BITS) << m.slope_bits, D3), -2000, 2000) - want
+    d, e = (_clip(first, -6, 6) + 6) * 9 + v.around_b * 2 + (v.n > 1), _sloped(v, want) * 4 + v.around_c
+    odd_b = _number(
+        m, v, _SLOPE_CB, near + doubt_b, thin, turned + min(_bucket(s_ba), 3), d, e, table[row, SLOPE + 2] - want
+    )
     table[row, SLOPE + 2] = want + odd_b
     want = _clip(_ratio((tilt_a * D1 + tilt_b * L21 >> _BITS) << m.slope_bits, D3), -2000, 2000)
-    odd_a = _number(m, _SLOPE_CA, near + doubt_a, thin, turned + min(_bucket(odd_b), 3), table[row, SLOPE + 1] - want)
+    first = _clip(_ratio((int(table[v.first, TILT]) * D1 >> _BITS) << m.slope_bits, D3), -2000, 2000) - want
+    d, e = (_clip(first, -6, 6) + 6) * 9 + v.around_a * 2 + (v.n > 1), _sloped(v, want) * 4 + v.around_c
+    odd_a = _number(
+        m, v, _SLOPE_CA, near + doubt_a, thin, turned + min(_bucket(odd_b), 3), d, e, table[row, SLOPE + 1] - want
+    )
     table[row, SLOPE + 1] = want + odd_a
     return odd_a, odd_b
 
@@ -252,10 +303,16 @@ def _code_mean(m: VoxelCoding, v: _Voxel, surprise: int) -> None:
     turn_b = _clip(table[v.first, STEP + 1], -1, 1) + 1 if v.n > 0 else 0
     context_a, context_b = (v.around_a * 3 + v.kind) * 3 + v.axis, (v.around_b * 3 + v.kind) * 3 + v.axis
     near_a = turn_a * 6 + min(_bucket(table[row, SLOPE]), 5)
-    odd_a = _number(m, _STEP_A, context_a, min(table[row, LEVEL], 15), near_a, table[row, STEP] - want_a)
+    e = (_clip(table[v.first, STEP], -6, 6) + 6) * 4 + v.around_a if v.n > 0 else 24 + v.around_a
+    odd_a = _number(
+        m, v, _STEP_A, context_a, min(table[row, LEVEL], 15), near_a, v.occupied, e, table[row, STEP] - want_a
+    )
     m_a = table[row, STEP] = want_a + odd_a
     near_b = turn_b * 6 + min(_bucket(m_a), 5)
-    odd_b = _number(m, _STEP_B, context_b, min(table[row, LEVEL + 1], 15), near_b, table[row, STEP + 1] - want_b)
+    e = (_clip(table[v.first, STEP + 1], -6, 6) + 6) * 4 + v.around_b if v.n > 0 else 24 + v.around_b
+    odd_b = _number(
+        m, v, _STEP_B, context_b, min(table[row, LEVEL + 1], 15), near_b, v.occupied, e, table[row, STEP + 1] - want_b
+    )
     m_b = table[row, STEP + 1] = want_b + odd_b
 
     D1, D2, D3 = _diagonal(m, row)
@@ -263,25 +320,45 @@ def _code_mean(m: VoxelCoding, v: _Voxel, surprise: int) -> None:
     fine = m.mean_bits - m.length_bits
     ya, yb, quantum = m_a << (fine - m.plane_bits), m_b << (fine - m.plane_bits), D3 << (fine - m.thin_bits)
     mu_a, mu_b = D1 * ya, L21 * ya + D2 * yb
-    height = 0
+    height = nearest = smooth = 0
     low, high = 1 << 60, -(1 << 60)
+    own_tilt_b = _clip((L32 << _BITS) // D2, -(4 << _BITS), 4 << _BITS)
+    own_tilt_a = _clip(((L31 << _BITS) - own_tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
     for i in range(v.n):
-        h = _height(m, v, m.refs[i], mu_a, mu_b)
-        height += h
+        h, s = _height(m, v, m.refs[i], mu_a, mu_b, own_tilt_a, own_tilt_b)
+        height, smooth = height + h, smooth + s
+        if i == 0:
+            nearest = h
         low, high = min(low, h), max(high, h)
     want = 0
     if v.n > 0:
         want = _clip(_ratio(_ratio(height, v.n) - (L31 * ya + L32 * yb), quantum), -4000, 4000)
     doubt = _bucket(_ratio(high - low, quantum)) if v.n > 1 else 0
     thin = _clip(table[row, LEVEL + 2], 0, 23)
-    odd_c = _number(m, _STEP_C, min(v.n, 3) * 6 + doubt, thin, surprise * 3 + v.kind, table[row, STEP + 2] - want)
+    d = (_clip(_ratio(_ratio(smooth, max(v.n, 1)) - _ratio(height, max(v.n, 1)), quantum), -6, 6) + 6) * 12
+    d += min(doubt, 3) * 3 + min(_bucket(_ratio(nearest - _ratio(height, max(v.n, 1)), quantum)), 2)
+    e = (_inside(m, v, want * quantum + (L31 * ya + L32 * yb)) * 4 + v.around_c) * 9 + min(thin // 2, 8)
+    odd_c = _number(
+        m, v, _STEP_C, min(v.n, 3) * 6 + doubt, thin, surprise * 3 + v.kind, d, e, table[row, STEP + 2] - want
+    )
     table[row, STEP + 2] = want + odd_c
 
 
 @bare_inlined
-def _number(m: VoxelCoding, family: int, a: int, b: int, c: int, value: int) -> int:
-    """A number of a family in its contexts a, b, c."""
+def _number(m: VoxelCoding, v: _Voxel, family: int, a: int, b: int, c: int, d: int, e: int, value: int) -> int:
+    """A number of a family in its contexts a, b, c, or in all five."""
     at = m.at + AXIS_CONTEXTS
+    m.state[0][FIELD] = family + 2
+    if m.five == 1:
+        more = m.at + VOXEL_CONTEXTS
+        five = (
+            at + _START[3 * family] + a * WIDTH,
+            at + _START[3 * family + 1] + b * WIDTH,
+            at + _START[3 * family + 2] + c * WIDTH,
+            more + _MORE_START[2 * family] + d * WIDTH,
+            more + _MORE_START[2 * family + 1] + e * WIDTH,
+        )
+        return code_signed_5(m.state, five, m.w + 2 + (min(v.n, 2) * 10 + family) * WIDTH, value)
     return code_signed(
         m.state,
         at + _START[3 * family] + a * WIDTH,
@@ -325,8 +402,12 @@ def _keep_tilts(m: VoxelCoding, row: int) -> None:
 
 
 @bare_inlined
-def _height(m: VoxelCoding, v: _Voxel, other: int, mu_a: int, mu_b: int) -> int:
-    """Height along the thin axis at which another voxel's plane passes (mu_a, mu_b) of this one, 2^-mean_bits m."""
+def _height(
+    m: VoxelCoding, v: _Voxel, other: int, mu_a: int, mu_b: int, own_tilt_a: int, own_tilt_b: int
+) -> tuple[int, int]:
+    """Height along the thin axis at which another voxel's plane passes (mu_a, mu_b) of this one, 2^-mean_bits m; the
+    same of a surface whose tilt changes evenly on its way from there to the own tilt.
+    """
     table, row, axis, fine = m.table, v.row, v.axis, m.mean_bits - m.length_bits
     D1, D2, D3 = _diagonal(m, other)
     L21, L31, L32 = _below_diagonal(m, other, D2, D3)
@@ -341,8 +422,29 @@ def _height(m: VoxelCoding, v: _Voxel, other: int, mu_a: int, mu_b: int) -> int:
     tilt_a, tilt_b = int(table[other, TILT]), int(table[other, TILT + 1])
     off_a = mu_a - (D1 * ya + to_a)
     off_b = mu_b - (L21 * ya + D2 * yb + to_b)
-    height: int = L31 * ya + L32 * yb + D3 * yc + to_c + (tilt_a * off_a + tilt_b * off_b >> _BITS)
-    return height
+    flat = L31 * ya + L32 * yb + D3 * yc + to_c
+    height: int = flat + (tilt_a * off_a + tilt_b * off_b >> _BITS)
+    smooth: int = flat + ((tilt_a + own_tilt_a) * off_a + (tilt_b + own_tilt_b) * off_b >> _BITS + 1)
+    return height, smooth
+
+
+@bare_inlined
+def _two_neighbours(v: _Voxel, one: int, two: int) -> int:
+    """By how much the first and the second neighbour differ from the mean, and who is above and below: 175 values."""
+    return (_clip(one, -3, 3) + 3) * 25 + (_clip(two, -2, 2) + 2) * 5 + v.around_c
+
+
+@bare_inlined
+def _inside(m: VoxelCoding, v: _Voxel, height: int) -> int:
+    """Where a height along the thin axis lies in the voxel: 0 below it … 8 above it, 4 in the middle."""
+    pitch = int(m.pitch[v.axis])
+    return _clip((height * 7 + (pitch * 9 >> 1)) // pitch, 0, 8)
+
+
+@bare_inlined
+def _sloped(v: _Voxel, want: int) -> int:
+    """How steep a slope is expected to be, in 27 steps."""
+    return _clip(want, -4, 4) + 4 + 9 * (0 if v.n == 0 else (1 if v.n < 3 else 2))
 
 
 def _around() -> I64:

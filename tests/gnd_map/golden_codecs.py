@@ -22,6 +22,8 @@ from gnd.gnd_map.codec import (
     encode_tiles,
 )
 from gnd.gnd_map.codec.lattice import Quantised, dequantise
+from gnd.gnd_map.codec.prior_sets import sets_of
+from gnd.gnd_map.codec.range_tile import encode_tile_by_set
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import content_sha
@@ -67,6 +69,8 @@ def messages() -> dict[str, bytes]:
         found[f"tile, codec {codec.codec_id}"] = codec.encode(TILE, g)
         found[f"nothing, codec {codec.codec_id}"] = codec.encode(TILE, Gaussians.empty())
     for name, lattice in LATTICES.items():
+        for number in range(len(sets_of(name))):
+            found[f"tile, {name}, set {number}"] = encode_tile_by_set(TILE, state(lattice, 0), lattice, number)
         found[f"delta, {name}"] = encode_delta(TILE, state(lattice, 0), state(lattice, 1))
     base, empty = state(standard, 0), Gaussians.empty()
     found["flags"] = encode_flags([flags_of(base), Flags(OTHER, empty, np.array([7], np.int32), np.ones(1, np.uint8))])

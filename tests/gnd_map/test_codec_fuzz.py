@@ -26,6 +26,8 @@ REPAIRED = {  # messages whose checksum is right again: they reach the entropy d
     "archive, range coded": 8_000, "standard, range coded": 8_000, "compact, range coded": 8_000,
     "archive, columns, Zstandard": 12_000, "standard, columns, Zstandard": 12_000,
     "compact, columns, Zstandard": 12_000,
+    "archive, range coded by sets": 2_000, "standard, range coded by sets": 4_000,
+    "compact, range coded by sets": 2_000,
     "delta": 1_500, "flags": 8_000, "measured": 800, "tiles": 60_000, "mask": 110_000,
 }  # fmt: skip
 LEFT_WRONG = {  # messages whose checksum stays as the damage leaves it; float32 columns have none
@@ -33,6 +35,8 @@ LEFT_WRONG = {  # messages whose checksum stays as the damage leaves it; float32
     "archive, range coded": 25_000, "standard, range coded": 25_000, "compact, range coded": 25_000,
     "archive, columns, Zstandard": 80_000, "standard, columns, Zstandard": 80_000,
     "compact, columns, Zstandard": 80_000,
+    "archive, range coded by sets": 8_000, "standard, range coded by sets": 8_000,
+    "compact, range coded by sets": 8_000,
     "delta": 8_000, "flags": 10_000, "measured": 6_000, "tiles": 60_000, "mask": 90_000,
 }  # fmt: skip
 BOUND_BYTES = 64 << 20

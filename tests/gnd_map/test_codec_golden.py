@@ -20,6 +20,7 @@ from gnd.gnd_map.codec import (
     is_on,
     snap,
 )
+from gnd.gnd_map.codec.range_tile import decode_tile_by_set
 from gnd.gnd_map.gaussian import Gaussians
 
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
@@ -43,6 +44,13 @@ def test_golden_tiles_are_read(codec: Any) -> None:
         codec.lattice or LATTICES["standard"], 0
     )
     assert codec.decode(TILE, BODIES[f"nothing, codec {codec.codec_id}"]) == Gaussians.empty()
+
+
+@pytest.mark.parametrize("name", [name for name in BODIES if ", set " in name])
+def test_golden_tiles_of_every_set_are_read(name: str) -> None:
+    lattice, number = LATTICES[name.split(", ")[1]], int(name.rpartition(" ")[2])
+    assert BODIES[name][0] == number
+    assert decode_tile_by_set(TILE, BODIES[name], lattice) == state(lattice, 0)
 
 
 @pytest.mark.parametrize("lattice", LATTICES.values(), ids=lambda lattice: lattice.name)

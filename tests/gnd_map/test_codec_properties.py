@@ -30,6 +30,7 @@ from gnd.gnd_map.codec import (
     snap,
     volume,
 )
+from gnd.gnd_map.codec.lattice import dequantise, quantise
 from gnd.gnd_map.errors import CodecError
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
@@ -88,17 +89,40 @@ def test_a_street_is_moved_by_little(lattice: Lattice) -> None:
 
 
 @by_lattice
-@given(count=st.integers(1, 2**31 - 1))
+@given(count=st.integers(1, 2**31 - 1), new_map=st.booleans())
 @few
-def test_counts_are_the_nearest_of_the_lattice_and_twenty_stay_enough(lattice: Lattice, count: int) -> None:
+def test_counts_are_the_nearest_of_the_lattice_and_twenty_stay_enough(
+    lattice: Lattice, count: int, new_map: bool
+) -> None:
     one = street(SEOUL, np.random.default_rng(2), 1)
     g = Gaussians(one.voxel_id, np.array([count], np.int32), one.cells, one.mean_m, one.cov_m2)
-    found, cells = (int(column[0]) for column in snap(g, lattice).columns[1:3])
-    assert found in lattice.counts
+    found, cells = (int(column[0]) for column in snap(g, lattice, new_map=new_map).columns[1:3])
+    numbers = (new_map and lattice.map_counts) or lattice.counts
+    assert set(numbers) <= set(lattice.counts)
+    assert found in numbers
     assert (found >= 20) == (count >= 20)
     assert cells == min(found, 20)
-    nearest = min(lattice.counts, key=lambda level: abs(np.log(level / count)))
+    nearest = min(numbers, key=lambda level: abs(np.log(level / count)))
     assert found == nearest or {found, nearest} == {10, 20}  # twenty stay enough
+
+
+def test_finer_counts_that_lie_on_the_lattice_stay() -> None:
+    """Tiles that were published before counts became coarser keep their content, and their hash."""
+    q = quantise(street(SEOUL, np.random.default_rng(2), 60), LATTICES["standard"])
+    assert len(np.unique(q.count)) > 4
+    g = dequantise(q, LATTICES["standard"])
+    assert snap(g, LATTICES["standard"], new_map=True) == g
+    assert len(np.unique(g.count)) == len(np.unique(q.count))
+
+
+def test_a_new_map_differs_from_a_merged_one_by_its_counts_only() -> None:
+    g = street(SEOUL, np.random.default_rng(2), 60)
+    merged, new = snap(g, LATTICES["standard"]), snap(g, LATTICES["standard"], new_map=True)
+    assert np.array_equal(merged.mean_m, new.mean_m)
+    assert np.array_equal(merged.cov_m2, new.cov_m2)
+    assert np.array_equal(merged.cells, new.cells)
+    assert len(np.unique(new.count)) < len(np.unique(merged.count))
+    assert is_on(new, LATTICES["standard"])
 
 
 @by_lattice

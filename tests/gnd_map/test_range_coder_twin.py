@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec import prior_sets
 from gnd.gnd_map.codec.coding import Coder
+from gnd.gnd_map.codec.prior_sets import sets_of
 from gnd.gnd_map.codec.priors import FILE, Priors, priors_of
 from gnd.gnd_map.errors import CodecError
 
 FROZEN = "59f266be96f04858921f72c0eebf9769bceb723fc4746d964717212d90baab01"
+FROZEN_SETS = "4c824765d25873b24c739a2004038aafc8ae130439727c15729441c12280c78d"
 KNOTS = k._KNOTS
 
 
@@ -42,15 +45,35 @@ class Twin:
         self.write(min(max(self.prob[at], 6), 65530), bit)
         self.learn(at, bit)
 
-    def mixed(self, places: tuple[int, int, int], w: int, bit: int) -> None:
+    def mixed(self, places: tuple[int, ...], w: int, bit: int) -> None:
+        """In three contexts or in five."""
         stretched = [stretch(self.prob[at]) for at in places]
-        d = sum(int(weight) * s for weight, s in zip(self.weight[w], stretched, strict=True)) // 65536
+        weights = self.weight[w][: len(places)]
+        d = sum(int(weight) * s for weight, s in zip(weights, stretched, strict=True)) // 65536
         p = squash(min(max(d, -2047), 2047))
         self.write(p, bit)
         for i, s in enumerate(stretched):
             self.weight[w, i] += (s * (bit * 65536 - p) * 6 + 2**19) // 2**20
         for at in places:
             self.learn(at, bit)
+
+    def signed(self, starts: tuple[int, ...], w: int, value: int) -> None:
+        """Length in ones and a zero, sign, digits from the second on: the first two in contexts of their own."""
+
+        def write(which: int, bit: int) -> None:
+            self.mixed(tuple(start + which for start in starts), w + which, bit)
+
+        length = abs(value).bit_length()
+        for j in range(min(length, 14)):
+            write(j, 1)
+        if length < 14:
+            write(length, 0)
+        if length:
+            write(14, int(value < 0))
+        for i in range(length - 2, -1, -1):
+            capped = min(length, 6)
+            which = {length - 2: 15 + capped - 2, length - 3: 15 + capped + 2}.get(i, 24)
+            write(which, abs(value) >> i & 1)
 
     def plain(self, at: int, value: int) -> None:
         length = abs(value).bit_length()
@@ -97,6 +120,25 @@ def test_the_kernels_write_what_the_twin_writes(seed: int) -> None:
     np.testing.assert_array_equal(coder.state[3], twin.weight)
 
 
+@pytest.mark.parametrize("number", [0, 2])
+def test_numbers_in_five_contexts_are_what_the_twin_writes(number: int) -> None:
+    rng, priors = random.Random(number), sets_of("standard")[number]
+    coder, twin, values = Coder.writing(priors, 4096, five=True), Twin(priors), []
+    for _ in range(150):
+        a, b, c, d, e = rng.sample(range(0, 40_000, k.WIDTH), 5)
+        values.append(((a, b, c, d, e), int(rng.gauss(0.0, 10.0 ** rng.randrange(4)))))
+        k.code_signed_5(coder.state, values[-1][0], 300, values[-1][1])
+        twin.signed(values[-1][0], 300, values[-1][1])
+    message = coder.finish()
+    body = message[:-2]
+    assert body[: len(twin.out)] == bytes(twin.out)
+    assert twin.low <= int.from_bytes(body[len(twin.out) :].ljust(4, b"\0"), "big") <= twin.high
+    assert [int(place) >> 8 for place in coder.state[2]] == twin.prob
+    np.testing.assert_array_equal(coder.state[3], twin.weight)
+    reader = Coder.reading(priors, message, five=True)
+    assert [k.code_signed_5(reader.state, at, 300, 0) for at, _ in values] == [value for _, value in values]
+
+
 def test_what_was_written_is_read_and_the_stream_ends() -> None:
     rng, values = random.Random(9), [0, 1, -1, 2**31 - 1, -(2**31 - 1)]
     values += [int(rng.gauss(0.0, 50.0)) for _ in range(500)]
@@ -123,4 +165,18 @@ def test_a_stream_read_too_far_or_not_to_its_end_is_refused() -> None:
 
 def test_the_frozen_start_never_changes() -> None:
     """Another file makes other bytes of the same tile: the codec ids would change their meaning."""
-    assert hashlib.sha256(resources.files("gnd.gnd_map.codec").joinpath(FILE).read_bytes()).hexdigest() == FROZEN
+    files = resources.files("gnd.gnd_map.codec")
+    assert hashlib.sha256(files.joinpath(FILE).read_bytes()).hexdigest() == FROZEN
+    assert hashlib.sha256(files.joinpath(prior_sets.FILE).read_bytes()).hexdigest() == FROZEN_SETS
+
+
+def test_sets_are_read_from_their_file_as_they_were_written() -> None:
+    sets = {name: sets_of(name) for name in prior_sets.LATTICES_WITH_SETS}
+    again = prior_sets.unpack(prior_sets.pack(sets))
+    for name, some in sets.items():
+        assert 1 < len(some) <= prior_sets.MOST_SETS
+        for one, other in zip(some, again[name], strict=True):
+            np.testing.assert_array_equal(one.places, other.places)
+            np.testing.assert_array_equal(one.weight, other.weight)
+            assert one.places.min() >= 0
+            assert one.places.max() < 1 << 24
