@@ -4,11 +4,13 @@ import logging
 import signal
 import threading
 from pathlib import Path
+from typing import get_args
 
 import click
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.merger import run_shard
+from gnd.cloud_merger.statements import Mode
 from gnd.fleet_bus.health_options import metrics_options
 from gnd.fleet_bus.settings_file import load_settings
 from gnd.fleet_bus.settings_options import settings_options
@@ -19,7 +21,7 @@ from gnd.gnd_map.settings import settings_text
 @click.option("--id", "shard_id", help="Name of this shard; each running shard needs its own.  [default: merger-1]")
 @click.option("--store", "store_path", help="File of the store that the shards share.  [default: map.sqlite]")
 @click.option("--connect", multiple=True, help="Endpoint of a router, tcp/host:port; may be repeated.")
-@click.option("--mode", type=click.Choice(["default", "paper"]), help="How votes are counted.  [default: default]")
+@click.option("--mode", type=click.Choice(get_args(Mode)), help="How votes are counted.  [default: default]")
 @settings_options
 @metrics_options
 def merger(

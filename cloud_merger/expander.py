@@ -22,6 +22,7 @@ from gnd.cloud_merger.ingest import one_line
 from gnd.cloud_merger.short_reports import FirstSaid, ShortReports
 from gnd.cloud_merger.states import STATUS
 from gnd.cloud_merger.stored import Bases, encoded_parts
+from gnd.cloud_merger.survey.inbox import SurveyInbox
 from gnd.cloud_merger.wants import asked_voxels
 from gnd.gnd_map.errors import GndError
 from gnd.schemas.changes import ChangeReport
@@ -30,6 +31,7 @@ from gnd.schemas.features import FeatureReport
 from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
+from gnd.schemas.survey import SurveyReport
 from gnd.tile_store.errors import IdTaken, StoreDamaged, StoreError
 from gnd.tile_store.store import Store
 from gnd.tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
@@ -75,7 +77,7 @@ class Expander:
         self._store, self._config, self._tell, self._on_journaled = store, config, tell, on_journaled
         self._short = ShortReports(store, config.merge, config.want, bases or Bases(store))
         self._features = FeatureInbox(store, config.features, config.feature_layer, config.ingest.reach_tiles)
-        self._map = MapCheck(store, config.ingest)
+        self._map, self._surveys = MapCheck(store, config.ingest), SurveyInbox(store)
         self._lock = Lock()
         self._districts: OrderedDict[str, None] = OrderedDict()  # newest last
 
@@ -159,6 +161,9 @@ class Expander:
         if isinstance(said, FeatureReport):
             self._features.check(claim.upload.key, said)
             return self._released(claim, tuple(self._features.rows(said, claim.upload.received_ns)))
+        if isinstance(said, SurveyReport):
+            self._surveys.keep(claim.upload.key, said, claim.upload.received_ns)
+            return self._released(claim, ())
         if isinstance(said, PackedGaussians):
             return self._second_half(claim, said)
         if isinstance(said, PackedReport):

@@ -17,6 +17,7 @@ from gnd.cloud_merger.ownership import Members, following
 from gnd.cloud_merger.reception import Reception
 from gnd.cloud_merger.states import States
 from gnd.cloud_merger.stored import Bases
+from gnd.cloud_merger.survey.mapper import RoadMapper
 from gnd.cloud_merger.warm import warm_up
 from gnd.cloud_merger.work import Worker, in_turn
 from gnd.cloud_merger.worker_process import Address, worker_process
@@ -35,6 +36,8 @@ ANNOUNCE_AT_ONCE: Final = 256
 TILES_AT_ONCE: Final = 16
 """Tiles that are claimed together; each is published as soon as it is merged."""
 ANNOUNCE_EVERY_S: Final = 0.05
+ROADS_EVERY_S: Final = 1.0
+"""Parts of surveys are looked for so often."""
 _EXPANDERS: Final = 2
 """Threads that look at what was acknowledged."""
 _LOG = logging.getLogger(__name__)
@@ -102,6 +105,8 @@ def run_worker(
         on_journaled = wake.set if config.store.merge_delay_s <= config.poll_s else lambda: None
         expander = Expander(store, config, States(store, bus).tell, on_journaled=on_journaled, bases=bases)
         stack.enter_context(working(expander.work, arrived, _EXPANDERS, config.poll_s))
+        roads = RoadMapper(store, config.shard_id, on_published=wake.set, codec=config.codec)
+        stack.enter_context(working(roads.work, threading.Event(), 1, ROADS_EVERY_S))  # surveys -> new roads
 
         worker, announcer = Worker(store, config, bases), Announcer(store, bus, members, bases)
         while not stop.is_set():

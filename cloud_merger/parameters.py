@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, get_args
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.statements import Mode, Report
@@ -32,8 +32,8 @@ class MergeParameters:
     mode: Mode = setting(
         "default",
         '"paper": only uploaded changes count (GND as printed, with the corrections without which it cannot '
-        'run); "default": the votes are those of all who observed the voxel, and similarity is the smooth '
-        "one.",
+        'run); "paper-observers": the same, but ξ is a share of all who observed the voxel; "default": the votes are '
+        "those of all who observed the voxel, and similarity is the smooth one.",
     )
     eps: float = setting(
         0.7,
@@ -58,16 +58,21 @@ class MergeParameters:
     )
     sensor_weights: Mapping[str, float] = setting(
         {"Scala": 0.5},
-        'Weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.',
+        "Weight of a vote by sensor model, 1 for the others; the paper's modes do not weigh.",
     )
 
     def __post_init__(self) -> None:
-        if self.mode not in ("paper", "default"):
-            raise MergerError(f"mode must be 'paper' or 'default', got {self.mode!r}")
+        if self.mode not in get_args(Mode):
+            raise MergerError(f"mode must be one of {', '.join(get_args(Mode))}, got {self.mode!r}")
         check_settings(self, MergerError)
         for model, weight in self.sensor_weights.items():
             if not 0 < weight <= 1:
                 raise MergerError(f"the weight of {model} must lie in (0, 1], got {weight}")
+
+    @property
+    def has_paper_rules(self) -> bool:
+        """Whether the rules are the paper's, in either reading of ξ."""
+        return self.mode != "default"
 
     def weight_of(self, sensor_model: str) -> float:
         """Return the weight of a vote of this sensor."""
@@ -75,7 +80,7 @@ class MergeParameters:
 
     def pose_m2_of(self, change: TileChange) -> float:
         """Return the variance of what a report measured by its poses, beyond what `noise_m` stands for."""
-        if self.mode == "paper" or not self.poses:
+        if self.has_paper_rules or not self.poses:
             return 0.0
         at_lever_m = MERGE_POSE_LEVER_M * change.pose_sigma_rad
         return max(change.pose_sigma_m**2 + at_lever_m**2 - MERGE_NOISE_M**2, 0.0)

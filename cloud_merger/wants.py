@@ -118,7 +118,7 @@ def _wanted_of_tile(
     """Of each flagged voxel of a tile whether it may win the vote, and whether to ask for its Gaussian."""
     asked = is_askable(own.change)
     ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
-    bases = quotable(known.bases) if merge.mode == "default" else {}
+    bases = {} if merge.mode == "paper" else quotable(known.bases)
     votes, cast, in_hand = known.votes.about(ids, own.change.base_sha, bases, but=own.report_id)
     if merge.mode == "default":
         remembered = _remembered(own, known, ids)
@@ -126,7 +126,7 @@ def _wanted_of_tile(
     votes, cast, in_hand = votes + own.weight, cast + own.weight, in_hand + _promised(known.promised, ids)
     xi = np.where(modified & (merge.mode == "default"), MERGE_XI_RESHAPED, merge.xi)
     may_win = votes > WANT_SHARE * xi * cast
-    asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
+    asked_anyway = _sample(~may_win, 0 if merge.has_paper_rules else want.sample)
     return may_win, np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
 
 

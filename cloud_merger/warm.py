@@ -47,7 +47,7 @@ def warm_up() -> None:
     decided(np.zeros(1, STATEMENT), base, MergeParameters())
     place = np.zeros(1, np.int64)
     changes_together(place, place, place, np.ones(1, np.bool_))
-    warm_up_shapes()
+    warm_up_shapes()  # those of the season, too
     _test_a_shift()
 
 

@@ -19,6 +19,7 @@ MAX_CHANGE_REPORT_BYTES: Final = 8 * MIB
 MAX_PACKED_REPORT_BYTES: Final = 1 * MIB
 MAX_PACKED_GAUSSIANS_BYTES: Final = 4 * MIB
 MAX_FEATURE_REPORT_BYTES: Final = 1 * MIB
+MAX_SURVEY_REPORT_BYTES: Final = 1 * MIB
 MAX_CHANGE_ACK_BYTES: Final = 64 * KIB
 MAX_REPORT_STATES_BYTES: Final = 64 * KIB
 MAX_REPORT_QUESTION_BYTES: Final = 4 * KIB
@@ -85,3 +86,12 @@ MAX_DETECTIONS_BYTES: Final = 128 * KIB
 MAX_POLYLINES_OF_LOOK: Final = 64
 MAX_POINTS_OF_LANE_LOOK: Final = 16_384
 MAX_LANE_LOOK_BYTES: Final = 256 * KIB
+
+# A part of a survey of a road that the map does not have: submaps of some twenty metres of way, what one of them holds,
+# how far it reaches, and how many parts a survey has.
+MAX_SUBMAPS_OF_SURVEY_PART: Final = 64
+MAX_PARTS_OF_SURVEY: Final = 1_024
+MAX_FIXES_OF_SURVEY_PART: Final = 1_024
+MAX_TILES_OF_SUBMAP: Final = 64
+MAX_GAUSSIANS_OF_SUBMAP: Final = 40_000
+MAX_STEP_OF_SURVEY_M: Final = 100.0

@@ -23,6 +23,7 @@ from gnd.schemas.errors import BadValue, TooLarge
 from gnd.schemas.features import FeatureReport, check_feature_bytes, report_of
 from gnd.schemas.generated import change_report_pb2, packed_gaussians_pb2, packed_report_pb2
 from gnd.schemas.report_id import check_report_id, report_id_of_bytes
+from gnd.schemas.survey import SURVEY_FIELD, SurveyReport, check_survey_bytes
 from gnd.schemas.wire import (
     MAJOR,
     PRINTABLE_PATTERN,
@@ -204,7 +205,7 @@ def crc_of(wanted: bytes) -> int:
     return zlib.crc32(wanted)
 
 
-def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians | FeatureReport:
+def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians | FeatureReport | SurveyReport:
     """Whatever a vehicle has sent on the key of change reports.
 
     Raises:
@@ -213,9 +214,12 @@ def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians 
     """
     _check_size("ChangeReport", data, limits.MAX_CHANGE_REPORT_BYTES)
     check_feature_bytes(data)
+    check_survey_bytes(data)
     message = parse(
         change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
     )
+    if message.HasField(SURVEY_FIELD):
+        return SurveyReport.decode(data)
     forms = [name for name in _FORMS if message.HasField(name)]  # type: ignore[arg-type]
     if not forms:
         return ChangeReport.decode(data)

@@ -7,8 +7,9 @@ from gnd.gnd_map.tile_id import District
 from gnd.schemas import limits
 from gnd.schemas.errors import BadValue, TooLarge
 from gnd.schemas.features import check_feature_bytes
-from gnd.schemas.generated import change_report_pb2, feature_report_pb2, packed_report_pb2
+from gnd.schemas.generated import change_report_pb2, feature_report_pb2, packed_report_pb2, survey_report_pb2
 from gnd.schemas.report_id import check_report_id, report_id_of_bytes
+from gnd.schemas.survey import SURVEY_FIELD, check_survey_bytes
 from gnd.schemas.wire import (
     LAYER_PATTERN,
     VEHICLE_PATTERN,
@@ -56,12 +57,15 @@ def head_of_upload(data: bytes) -> UploadHead:
             vehicle, times that cannot be; more than one form in one message.
     """
     check_feature_bytes(data)
+    check_survey_bytes(data)
     message = parse(
         change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
     )
     forms = [name for name in _SHORT if message.HasField(name)]
     form: UploadForm = forms[0] if forms else "whole"
     check_major(message, "ChangeReport")
+    if message.HasField(SURVEY_FIELD):
+        return _head_of_survey(message, len(data))
     if forms:
         others = sorted(field.name for field, _ in message.ListFields() if field.name not in ("major", form))
         if others:
@@ -81,10 +85,25 @@ def head_of_upload(data: bytes) -> UploadHead:
     return _head(form, message.report_id, message, length_ns, (message.layer, message.district))
 
 
+def _head_of_survey(message: change_report_pb2.ChangeReport, size: int) -> UploadHead:
+    """A part of a survey goes whole, and is kept like a whole report."""
+    others = sorted(field.name for field, _ in message.ListFields() if field.name not in ("major", SURVEY_FIELD))
+    if others:
+        raise BadValue(f"ChangeReport holds a survey and also {', '.join(others)}: one report in one form")
+    if size > limits.MAX_SURVEY_REPORT_BYTES:
+        raise TooLarge(f"survey of {size} bytes exceeds the limit of {limits.MAX_SURVEY_REPORT_BYTES} bytes")
+    survey = message.survey
+    report_id = report_id_of_bytes(survey.report_id)
+    return _head("whole", report_id, survey, survey.length_ns, (survey.layer, survey.district))
+
+
 def _head(
     form: UploadForm,
     report_id: str,
-    message: change_report_pb2.ChangeReport | packed_report_pb2.PackedReport | feature_report_pb2.FeatureReport,
+    message: change_report_pb2.ChangeReport
+    | packed_report_pb2.PackedReport
+    | feature_report_pb2.FeatureReport
+    | survey_report_pb2.SurveyReport,
     length_ns: int,
     place: tuple[str, str] | None = None,
 ) -> UploadHead:

@@ -12,7 +12,7 @@ from typing import Final, Literal
 from zlib import crc32
 
 from gnd.fleet_bus.errors import Refused
-from gnd.gnd_map.codec import CODECS, best_codec, codec_of, lattice_of
+from gnd.gnd_map.codec import CODECS, RANGE_CODECS, best_codec, codec_of, lattice_of
 from gnd.gnd_map.content import FEATURE_CODECS, AnyTile, codecs_of_layer, encode_content_delta, has_deltas
 from gnd.gnd_map.day import UNKNOWN_DAY
 from gnd.gnd_map.errors import CodecError, GndError
@@ -143,7 +143,7 @@ class TileAnswers:
 
     def _sent(self, stored: StoredTile, held: StoredTile | None, codecs: Sequence[int]) -> _Sent:
         # A delta is coded like the body in the store; floats have no short one.
-        if held is not None and has_deltas(stored.codec_id) and stored.codec_id in codecs:
+        if held is not None and has_deltas(stored.codec_id) and reads_deltas(stored.codec_id, codecs):
             body = self._delta(held, stored)
             if body is not None and len(body) < len(stored.body):
                 return _Sent("delta", 0, body)
@@ -235,6 +235,15 @@ def _bytes_of(tile: AnyTile) -> int:
 def reads_layer(layer: str, codecs: Sequence[int]) -> bool:
     """Whether a client that names these codecs reads any of those that a layer may come in."""
     return not set(codecs).isdisjoint(codecs_of_layer(layer))
+
+
+def reads_deltas(codec_id: int, codecs: Sequence[int]) -> bool:
+    """Whether a client that names these codecs reads deltas of content in a codec: it reads that one, or another range
+    codec of its lattice, for deltas are range coded in one way.
+    """
+    return codec_id in codecs or any(
+        other in RANGE_CODECS and lattice_of(other) is lattice_of(codec_id) for other in codecs if codec_id in CODECS
+    )
 
 
 def same_lattice(one: int, other: int) -> bool:

@@ -291,4 +291,7 @@ def _tiles(accumulators: Sequence[VoxelAccumulator], n_min_cells: int, lattice: 
     if not found:
         voxels = sum(len(accumulator) for accumulator in accumulators)
         raise BuildError(f"none of {voxels} voxels with points has {n_min_cells} occupied sub-cells: too few scans?")
-    return [Tile(tile, 1, found[tile] if lattice is None else snap(found[tile], lattice)) for tile in sorted(found)]
+    return [
+        Tile(tile, 1, found[tile] if lattice is None else snap(found[tile], lattice, new_map=True))
+        for tile in sorted(found)
+    ]

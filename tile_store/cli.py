@@ -31,6 +31,7 @@ from gnd.tile_store.options import PATH, existing, json_option, layer_option, re
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.status import status
+from gnd.tile_store.survey_cli import survey
 
 __all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", "show", "store", "store_to_fill"]
 
@@ -105,7 +106,7 @@ def map_group() -> None:
     """Inspect, compare, export and roll back maps; `gnd map build` is in `deploy.map_cli`, above the segmentation."""
 
 
-for _command in (status, *upkeep_cli.COMMANDS):
+for _command in (status, survey, *upkeep_cli.COMMANDS):
     map_group.add_command(_command)
 
 

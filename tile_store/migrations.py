@@ -25,6 +25,7 @@ STEPS: Final = (
     (6, "schema_of_operations"),
     (7, "schema_of_uploads"),
     (8, "schema_of_parameters"),
+    (9, "schema_of_new_roads"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 

@@ -18,6 +18,7 @@ from gnd.tile_store import sqlite_confirmation as confirmation
 from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_journal as journal
 from gnd.tile_store import sqlite_refuted as refuted
+from gnd.tile_store import sqlite_roads as roads
 from gnd.tile_store import sqlite_uploads as uploads
 from gnd.tile_store import sqlite_versions as versions
 from gnd.tile_store.backup import copy_store
@@ -25,6 +26,7 @@ from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownVersion
 from gnd.tile_store.provenance import Provenance, decode_provenance
 from gnd.tile_store.regions import morton_range
 from gnd.tile_store.retention import trim_quarantine
+from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.rows_kept import RowsKept
 from gnd.tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
@@ -191,6 +193,15 @@ class SqliteStore:
         return self._writer.run(lambda c: uploads.forget(c, before_ns))
 
     # The inbox
+
+    def put_road_part(self, part: RoadPart) -> PutStatus:
+        """See `Store.put_road_part`."""
+        return self._writer.run(lambda c: roads.put_part(c, part))
+
+    def road_reports(self, layer: str) -> set[str]:
+        """See `Store.road_reports`."""
+        with self._readers.snapshot() as c:
+            return roads.report_ids(c, layer)
 
     def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
         """See `Store.put_reports`."""

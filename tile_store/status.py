@@ -25,6 +25,7 @@ WORDS: Final[dict[WaitingReason, str]] = {
     "shift": "a shift of its poses explains it",
     "named": "its reports are shifted again and again",
     "parked": "the shape of a vehicle, and has not stood for long",
+    "season": "leaves of a tree that stayed",
 }
 
 DOUBTED: Final = ("doubtful", "shift")
@@ -95,13 +96,15 @@ def _doubts_of(store: Store, waiting: WaitingChange) -> list[str]:
 
 
 def waiting_totals(store: Store) -> dict[str, int]:
-    """How many tiles and voxels wait for a second witness, and how many voxels for having stood long enough; a voxel
-    counts once for each vehicle that claims it.
+    """How many tiles and voxels wait for a second witness, how many voxels for having stood long enough, and how many
+    follow the season; a voxel counts once for each vehicle that claims it.
     """
-    waiting = [one for one in store.waiting_changes() if one.reason != "parked"]
-    parked = sum(one.voxels for one in store.waiting_changes() if one.reason == "parked")
+    waiting = [one for one in store.waiting_changes() if one.reason not in ("parked", "season")]
+    parked, season = (
+        sum(one.voxels for one in store.waiting_changes() if one.reason == r) for r in ("parked", "season")
+    )
     tiles = {(one.layer, one.tile) for one in waiting}
-    return {"tiles": len(tiles), "voxels": sum(one.voxels for one in waiting), "parked": parked}
+    return {"tiles": len(tiles), "voxels": sum(one.voxels for one in waiting), "parked": parked, "season": season}
 
 
 def named_vehicles(store: Store) -> list[dict[str, Any]]:
@@ -206,6 +209,7 @@ def _waiting_table(waiting: dict[str, Any]) -> Table:
     title = (
         f"waiting for confirmation by a second vehicle or drive: {waiting['voxels']} voxels in {waiting['tiles']} tiles"
         + (f"; parked: {waiting['parked']} voxels" if waiting["parked"] else "")
+        + (f"; leaves: {waiting['season']} voxels" if waiting["season"] else "")
     )
     table = Table("layer", "tile", "vehicle", "voxels", "of seen", "since (UTC)", "because", title=title)
     for one in waiting["claims"]:

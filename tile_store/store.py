@@ -7,6 +7,7 @@ from typing import Protocol
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import CatalogEntry
+from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from gnd.tile_store.values import (
     DEFAULT_LAYER,
@@ -76,6 +77,14 @@ class Store(Protocol):
 
     def forget_uploads(self, before_ns: int) -> int:
         """Forget what came before a time and is settled; the number forgotten. The journal keeps its reports."""
+
+    def put_road_part(self, part: RoadPart) -> PutStatus:
+        """Keep a part of a survey of a road that the map does not have; one that is known is a "duplicate". IdTaken:
+        its survey is another vehicle's or layer's, or the part has come with another report id.
+        """
+
+    def road_reports(self, layer: str) -> set[str]:
+        """The ids of the reports that brought surveys; `reports` does not give these."""
 
     # The inbox
 

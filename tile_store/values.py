@@ -21,7 +21,7 @@ from gnd.tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
-WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named", "parked"]
+WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named", "parked", "season"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -429,7 +429,7 @@ class Unconfirmed:
         reason: "share": too large a share; "isolated": little, but nothing beside it has come or gone; "poses": of
             reports with poor poses only; "doubtful": the vehicle doubts it itself; "shift": a shift of its poses
             explains it; "named": its reports are shifted again and again; "parked": it has the shape of a vehicle
-            and has not stood for long, whoever saw it.
+            and has not stood for long, whoever saw it; "season": it came or went in the crown of a tree that stayed.
     """
 
     vehicle: str

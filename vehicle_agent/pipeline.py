@@ -39,6 +39,7 @@ from gnd.vehicle_agent.report.sink import NewReports, OutgoingReport, ReportList
 from gnd.vehicle_agent.result import HealthTimeline
 from gnd.vehicle_agent.scans import Guard
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
+from gnd.vehicle_agent.survey.surveyor import Surveyor
 
 if TYPE_CHECKING:
     from gnd.vehicle_agent.features.layers import FeatureLayers
@@ -184,6 +185,7 @@ class Pipeline(Generic[TilesT]):
         guard: what could not be used, by its state.
         timeline: when the health changed.
         scans: usable ones so far.
+        surveyor: maps roads that the map does not have; None where the vehicle only localises.
     """
 
     def __init__(
@@ -224,6 +226,10 @@ class Pipeline(Generic[TilesT]):
         touched: Touched = (lambda _: False) if self.change is None else self.change.detector.touched
         self.tiles = tiles(self.local_map, touched)
         self.layers = self._feature_layers(identity, fix.t_ns)
+        self.surveyor: Surveyor | None = None
+        if identity is not None and isinstance(self.localisation, Localiser):
+            mount, segment = header.T_vehicle_lidar, self.parameters.segment
+            self.surveyor = Surveyor(mount, self.local_map, self.localisation, segment, identity, self._new_reports)
         self._feature_tiles, self._placed = feature_tiles, parts.placed
 
     def push(self, item: DriveItem) -> Output:
@@ -244,6 +250,8 @@ class Pipeline(Generic[TilesT]):
                     self.change.report(scan, self.place.odometer_m)  # tiles left behind -> classes -> reports
                     self._judge(scan)  # observations + feature tiles -> what exists, is gone, is new -> reports
         self._note(item)
+        if self.surveyor is not None:
+            self.surveyor.push(item, self.place)  # where the map has no road: scans -> submaps -> surveys
         return self._output(poses)
 
     def finish(self) -> Output:
@@ -257,6 +265,8 @@ class Pipeline(Generic[TilesT]):
             self.change.reporter.report_all(self.place.odometer_m)
         if self.layers is not None:
             self.layers.finish()
+        if self.surveyor is not None:
+            self.surveyor.finish()
         return self._output(poses)
 
     @property
@@ -317,6 +327,7 @@ class Pipeline(Generic[TilesT]):
             "nis": localiser.innovations.mean,
             "points_travelling_along": localiser.points_travelling_along,
             "calibration": localiser.calibration.as_json(),
+            "surveys": {} if self.surveyor is None else self.surveyor.account(),
         }
 
     def _follow(self) -> None:
@@ -336,6 +347,8 @@ class Pipeline(Generic[TilesT]):
 
     def _take_pose(self, scan: RefinedScan, poses: list[PoseEstimate]) -> None:
         poses.append(scan.estimate)
+        if self.surveyor is not None:
+            self.surveyor.take_final(scan.estimate)
         for placed in self._placed:
             placed(scan)
 

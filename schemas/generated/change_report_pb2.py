@@ -26,16 +26,17 @@ from . import course_pb2 as gnd_dot_v1_dot_course__pb2
 from . import feature_report_pb2 as gnd_dot_v1_dot_feature__report__pb2
 from . import packed_gaussians_pb2 as gnd_dot_v1_dot_packed__gaussians__pb2
 from . import packed_report_pb2 as gnd_dot_v1_dot_packed__report__pb2
+from . import survey_report_pb2 as gnd_dot_v1_dot_survey__report__pb2
 from . import tile_change_pb2 as gnd_dot_v1_dot_tile__change__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/change_report.proto\x12\x06gnd.v1\x1a\x13gnd/v1/course.proto\x1a\x1bgnd/v1/feature_report.proto\x1a\x1dgnd/v1/packed_gaussians.proto\x1a\x1agnd/v1/packed_report.proto\x1a\x18gnd/v1/tile_change.proto\"\xeb\x02\n\x0c\x43hangeReport\x12\r\n\x05major\x18\x01 \x01(\r\x12\x11\n\treport_id\x18\x02 \x01(\t\x12\x0f\n\x07vehicle\x18\x03 \x01(\t\x12\x14\n\x0csensor_model\x18\x04 \x01(\t\x12\x10\n\x08software\x18\x05 \x01(\t\x12\r\n\x05layer\x18\x06 \x01(\t\x12\x10\n\x08\x64istrict\x18\x07 \x01(\t\x12\x10\n\x08\x66irst_ns\x18\x08 \x01(\x10\x12\x0f\n\x07last_ns\x18\t \x01(\x10\x12!\n\x05tiles\x18\n \x03(\x0b\x32\x12.gnd.v1.TileChange\x12$\n\x06packed\x18\x0b \x01(\x0b\x32\x14.gnd.v1.PackedReport\x12*\n\tgaussians\x18\x0c \x01(\x0b\x32\x17.gnd.v1.PackedGaussians\x12\'\n\x08\x66\x65\x61tures\x18\r \x01(\x0b\x32\x15.gnd.v1.FeatureReport\x12\x1e\n\x06\x63ourse\x18\x0e \x01(\x0b\x32\x0e.gnd.v1.Courseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/change_report.proto\x12\x06gnd.v1\x1a\x13gnd/v1/course.proto\x1a\x1bgnd/v1/feature_report.proto\x1a\x1dgnd/v1/packed_gaussians.proto\x1a\x1agnd/v1/packed_report.proto\x1a\x1agnd/v1/survey_report.proto\x1a\x18gnd/v1/tile_change.proto\"\x91\x03\n\x0c\x43hangeReport\x12\r\n\x05major\x18\x01 \x01(\r\x12\x11\n\treport_id\x18\x02 \x01(\t\x12\x0f\n\x07vehicle\x18\x03 \x01(\t\x12\x14\n\x0csensor_model\x18\x04 \x01(\t\x12\x10\n\x08software\x18\x05 \x01(\t\x12\r\n\x05layer\x18\x06 \x01(\t\x12\x10\n\x08\x64istrict\x18\x07 \x01(\t\x12\x10\n\x08\x66irst_ns\x18\x08 \x01(\x10\x12\x0f\n\x07last_ns\x18\t \x01(\x10\x12!\n\x05tiles\x18\n \x03(\x0b\x32\x12.gnd.v1.TileChange\x12$\n\x06packed\x18\x0b \x01(\x0b\x32\x14.gnd.v1.PackedReport\x12*\n\tgaussians\x18\x0c \x01(\x0b\x32\x17.gnd.v1.PackedGaussians\x12\'\n\x08\x66\x65\x61tures\x18\r \x01(\x0b\x32\x15.gnd.v1.FeatureReport\x12\x1e\n\x06\x63ourse\x18\x0e \x01(\x0b\x32\x0e.gnd.v1.Course\x12$\n\x06survey\x18\x0f \x01(\x0b\x32\x14.gnd.v1.SurveyReportb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.change_report_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_CHANGEREPORT']._serialized_start=174
-  _globals['_CHANGEREPORT']._serialized_end=537
+  _globals['_CHANGEREPORT']._serialized_start=202
+  _globals['_CHANGEREPORT']._serialized_end=603
 # @@protoc_insertion_point(module_scope)

@@ -8,6 +8,7 @@ from . import course_pb2 as _course_pb2
 from . import feature_report_pb2 as _feature_report_pb2
 from . import packed_gaussians_pb2 as _packed_gaussians_pb2
 from . import packed_report_pb2 as _packed_report_pb2
+from . import survey_report_pb2 as _survey_report_pb2
 from . import tile_change_pb2 as _tile_change_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
@@ -27,7 +28,7 @@ DESCRIPTOR: _descriptor.FileDescriptor
 class ChangeReport(_message.Message):
     """What a vehicle sends on gnd/v1/change/<layer>/<q5>/<q10>/<q15> when it has left tiles of a district behind: a whole
     report in fields 2 to 10; or in `packed` its flags first; or in `gaussians` what the ack of those has asked for; or, of
-    a feature layer, a whole report in `features`.
+    a feature layer, a whole report in `features`; or in `survey` a part of a road that the map does not have.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -46,6 +47,7 @@ class ChangeReport(_message.Message):
     GAUSSIANS_FIELD_NUMBER: _builtins.int
     FEATURES_FIELD_NUMBER: _builtins.int
     COURSE_FIELD_NUMBER: _builtins.int
+    SURVEY_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     report_id: _builtins.str
@@ -84,6 +86,10 @@ class ChangeReport(_message.Message):
     def course(self) -> _course_pb2.Course:
         """Where the vehicle drives in its own frame; absent = it does not know. A report in short has it in `packed`."""
 
+    @_builtins.property
+    def survey(self) -> _survey_report_pb2.SurveyReport:
+        """A part of a survey of a road that the map does not have; then all other fields but `major` are empty."""
+
     def __init__(
         self,
         *,
@@ -101,10 +107,11 @@ class ChangeReport(_message.Message):
         gaussians: _packed_gaussians_pb2.PackedGaussians | None = ...,
         features: _feature_report_pb2.FeatureReport | None = ...,
         course: _course_pb2.Course | None = ...,
+        survey: _survey_report_pb2.SurveyReport | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["course", b"course", "features", b"features", "gaussians", b"gaussians", "packed", b"packed"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["course", b"course", "features", b"features", "gaussians", b"gaussians", "packed", b"packed", "survey", b"survey"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["course", b"course", "district", b"district", "features", b"features", "first_ns", b"first_ns", "gaussians", b"gaussians", "last_ns", b"last_ns", "layer", b"layer", "major", b"major", "packed", b"packed", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "vehicle", b"vehicle"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["course", b"course", "district", b"district", "features", b"features", "first_ns", b"first_ns", "gaussians", b"gaussians", "last_ns", b"last_ns", "layer", b"layer", "major", b"major", "packed", b"packed", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "survey", b"survey", "tiles", b"tiles", "vehicle", b"vehicle"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

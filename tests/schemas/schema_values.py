@@ -29,6 +29,8 @@ GOLDEN_DIR = Path(__file__).parent / "golden"
 TILE = TileId(497353963154)
 EAST = TileId(497353963155)
 SHA = bytes(range(32))
+BEFORE_SETS = (4, 3, 2, 7, 6, 5, 1, 0)
+"""All codecs of clients that do not read those by sets of tables."""
 OTHER_SHA = bytes(range(100, 132))
 REPORT_ID = deterministic_report_id(1_700_000_000_000, "car-1", b"drive")
 
@@ -140,14 +142,16 @@ NEXT = Tile(TILE, 4, snap(gaussians([-604, 7, 8], count=300), LATTICES["standard
 GOLDEN: dict[str, Any] = {
     "TileRequest-nothing_cached": TileRequest(codecs=(0,), deltas=False),
     "TileRequest-cached-two_codecs": TileRequest(3, SHA, (1, 0), deltas=False),
-    "TileRequest-cached-every_codec-deltas": TileRequest(3, SHA, (4, 3, 2, 7, 6, 5, 1, 0)),
+    "TileRequest-cached-every_codec-deltas": TileRequest(3, SHA, BEFORE_SETS),
     "TileReply-blob": TileReply("blob", blob_of(Tile(TILE, 7, gaussians([-604, 0, 604])))),
     "TileReply-blob-empty_tile": TileReply("blob", blob_of(Tile(TILE, 1, Gaussians.empty()))),
     "TileReply-unchanged": TileReply("unchanged"),
     "TileReply-absent": TileReply("absent"),
     "TileReply-delta": TileReply("delta", delta=CodedDelta(TILE, 8, SHA, b"not looked into")),
-    "TilesRequest-nothing_held": TilesRequest(((0, 0), (274, 0), (1023, 0))),
-    "TilesRequest-digest": TilesRequest(((274, 3), (275, 0), (276, 2**31 - 1)), SHA[:8], max_bytes=60_000, near=274),
+    "TilesRequest-nothing_held": TilesRequest(((0, 0), (274, 0), (1023, 0)), codecs=BEFORE_SETS),
+    "TilesRequest-digest": TilesRequest(
+        ((274, 3), (275, 0), (276, 2**31 - 1)), SHA[:8], codecs=BEFORE_SETS, max_bytes=60_000, near=274
+    ),
     "TilesRequest-hashes": TilesRequest(
         ((274, 3), (275, 0), (276, 1)), held_hashes=(SHA[:8], OTHER_SHA[:8]), codecs=(1, 0)
     ),

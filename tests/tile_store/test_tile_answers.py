@@ -13,6 +13,7 @@ from gnd.gnd_map.codec import (
     CODEC_FLOAT32,
     CODEC_FLOAT32_ZSTD,
     CODEC_STANDARD,
+    CODEC_STANDARD_SETS,
     CODEC_STANDARD_ZSTD,
     LATTICES,
     PREFERRED,
@@ -32,6 +33,8 @@ from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoredTile
 
 DISTRICT = TILE.district
+BEFORE_SETS = (4, 3, 2, 7, 6, 5, 1, 0)
+"""All codecs of clients that do not read those by sets of tables."""
 
 
 def street(tile: TileId, seed: int, changed: int = 0, lattice: str | None = "standard") -> Tile:
@@ -90,6 +93,19 @@ def test_who_holds_any_older_version_gets_a_delta_that_gives_the_newest(store: S
     assert answers.one(store.get("ndt", TILE), TileRequest(3, newest.sha)).status == "unchanged"
 
 
+def test_a_client_that_does_not_read_sets_of_tables_gets_the_older_codec_and_deltas(store: SqliteStore) -> None:
+    versions = [put(store, street(TILE, 1, changed))[0] for changed in (0, 4)]
+    answers, head = TileAnswers(store), store.get("ndt", TILE)
+    assert head.codec_id == CODEC_STANDARD_SETS
+    whole = answers.one(head, TileRequest(codecs=BEFORE_SETS)).blob
+    assert whole is not None
+    assert (whole.codec_id, tile_of(whole)) == (CODEC_STANDARD, versions[1])
+    reply = answers.one(head, TileRequest(1, versions[0].sha, codecs=BEFORE_SETS))
+    assert reply.delta is not None
+    assert tile_after(reply.delta, versions[0]) == versions[1]
+    assert reply.delta == answers.one(head, TileRequest(1, versions[0].sha)).delta
+
+
 def test_a_version_that_has_gone_or_never_was_here_gets_the_whole_tile(store: SqliteStore) -> None:
     versions = [put(store, street(TILE, 1, changed))[0] for changed in (0, 4, 8)]
     store.gc(1)
@@ -111,11 +127,13 @@ def test_who_cannot_read_deltas_gets_the_whole_tile(store: SqliteStore) -> None:
         assert answers.one(head, request).status == "blob"
 
 
-@pytest.mark.parametrize("codec_id", [CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD_ZSTD, CODEC_STANDARD])
+@pytest.mark.parametrize(
+    "codec_id", [CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD_ZSTD, CODEC_STANDARD, CODEC_STANDARD_SETS]
+)
 def test_a_client_that_reads_few_codecs_gets_the_tile_in_one_of_them(store: SqliteStore, codec_id: int) -> None:
     (tile,) = put(store, street(TILE, 1))
     head = store.get("ndt", TILE)
-    assert head.codec_id == CODEC_STANDARD
+    assert head.codec_id == CODEC_STANDARD_SETS
     reply = TileAnswers(store).one(head, TileRequest(codecs=(99, codec_id)))
     assert reply.blob is not None
     assert (reply.blob.codec_id, tile_of(reply.blob)) == (codec_id, tile)
@@ -130,11 +148,12 @@ def test_the_first_codec_that_fits_is_taken_in_the_clients_order(store: SqliteSt
         assert reply.blob is not None
         return reply.blob.codec_id
 
-    assert codec_of(TILE, *PREFERRED) == CODEC_STANDARD
+    assert codec_of(TILE, *PREFERRED) == CODEC_STANDARD_SETS
+    assert codec_of(TILE, *BEFORE_SETS) == CODEC_STANDARD
     assert codec_of(TILE, CODEC_FLOAT32, CODEC_STANDARD) == CODEC_FLOAT32
     assert codec_of(TILE, 2, 4, 7, CODEC_STANDARD_ZSTD, 0) == CODEC_STANDARD_ZSTD
     assert codec_of(EAST, *PREFERRED) == CODEC_FLOAT32_ZSTD
-    with pytest.raises(Refused, match=rf"comes in codec {CODEC_STANDARD}, asked for \(2, 4\)"):
+    with pytest.raises(Refused, match=rf"comes in codec {CODEC_STANDARD_SETS}, asked for \(2, 4\)"):
         codec_of(TILE, 2, 4)
 
 
@@ -162,7 +181,7 @@ def test_a_tile_too_large_for_a_message_in_the_clients_codec_is_refused(
     put(store, street(TILE, 1))
     monkeypatch.setattr("gnd.tile_store.answers.MAX_TILE_BODY_BYTES", 10_000)
     answers, head = TileAnswers(store), store.get("ndt", TILE)
-    with pytest.raises(Refused, match=r"has 14404 bytes in codec 0, a message holds 10000; it comes in codec 3"):
+    with pytest.raises(Refused, match=r"has 14404 bytes in codec 0, a message holds 10000; it comes in codec 9"):
         answers.one(head, TileRequest(codecs=(CODEC_FLOAT32,)))
     assert answers.one(head, TileRequest()).blob is not None
 

@@ -813,3 +813,88 @@ SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COALESCE(MAX(arrival), 0) FROM 
 
 -- name: touch
 UPDATE quarantine_size SET messages = messages
+
+-- name: schema_of_new_roads
+-- Added later, too. Roads that the map does not have: parts of surveys as they came, and what each tile has become.
+CREATE TABLE IF NOT EXISTS road_part (
+  arrival     INTEGER PRIMARY KEY,
+  survey_id   TEXT    NOT NULL,
+  part        INTEGER NOT NULL,
+  report_id   TEXT    NOT NULL,
+  layer       TEXT    NOT NULL,
+  vehicle     TEXT    NOT NULL,
+  received_ns INTEGER NOT NULL,
+  body        BLOB    NOT NULL,
+  UNIQUE (survey_id, part)
+) STRICT;
+CREATE INDEX IF NOT EXISTS road_part_layer ON road_part (layer, arrival);
+CREATE TABLE IF NOT EXISTS road_tile (
+  layer        TEXT    NOT NULL,
+  tile         INTEGER NOT NULL,
+  state        TEXT    NOT NULL CHECK (state IN ('draft', 'waiting', 'published')),
+  reason       TEXT    NOT NULL,
+  drives       INTEGER NOT NULL,
+  vehicles     TEXT    NOT NULL,
+  sigma_m      REAL    NOT NULL,
+  apart_m      REAL,
+  voxels       INTEGER NOT NULL,
+  alone        INTEGER NOT NULL,
+  first_ns     INTEGER NOT NULL,
+  last_ns      INTEGER NOT NULL,
+  updated_ns   INTEGER NOT NULL,
+  base_version INTEGER NOT NULL,
+  version      INTEGER NOT NULL,
+  codec_id     INTEGER NOT NULL,
+  body         BLOB    NOT NULL,
+  PRIMARY KEY (layer, tile)
+) STRICT, WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS road_work (
+  layer    TEXT    PRIMARY KEY,
+  done     INTEGER NOT NULL DEFAULT 0,
+  owner    TEXT    NOT NULL DEFAULT '',
+  boot     TEXT    NOT NULL DEFAULT '',
+  lease_ns INTEGER NOT NULL DEFAULT 0
+) STRICT, WITHOUT ROWID;
+
+-- name: insert_road_part
+INSERT INTO road_part (survey_id, part, report_id, layer, vehicle, received_ns, body)
+VALUES (:survey_id, :part, :report_id, :layer, :vehicle, :received_ns, :body) ON CONFLICT (survey_id, part) DO NOTHING
+
+-- name: heads_of_survey
+SELECT part, report_id, layer, vehicle FROM road_part WHERE survey_id = :survey_id
+
+-- name: open_road_layers
+SELECT p.layer, COUNT(*), MIN(p.received_ns), MAX(p.received_ns), MAX(p.arrival)
+FROM road_part AS p LEFT JOIN road_work AS w USING (layer) WHERE p.arrival > COALESCE(w.done, 0) GROUP BY p.layer
+
+-- name: lease_roads
+INSERT INTO road_work (layer, owner, boot, lease_ns) VALUES (:layer, :owner, :boot, :until)
+ON CONFLICT (layer) DO UPDATE SET owner = excluded.owner, boot = excluded.boot, lease_ns = excluded.lease_ns
+WHERE owner = '' OR owner = excluded.owner OR boot <> excluded.boot OR lease_ns <= :now
+
+-- name: free_roads
+UPDATE road_work SET owner = '', lease_ns = 0 WHERE layer = :layer AND owner = :owner
+
+-- name: roads_done
+UPDATE road_work SET done = MAX(done, :done) WHERE layer = :layer AND owner = :owner
+
+-- name: road_parts
+SELECT arrival, body FROM road_part WHERE layer = :layer ORDER BY arrival
+
+-- name: road_reports
+SELECT DISTINCT report_id FROM road_part WHERE layer = :layer
+
+-- name: road_tiles
+SELECT layer, tile, state, reason, drives, vehicles, sigma_m, apart_m, voxels, alone, first_ns, last_ns, updated_ns,
+  base_version, version, codec_id, body FROM road_tile WHERE layer = :layer ORDER BY tile
+
+-- name: put_road_tile
+INSERT INTO road_tile VALUES (:layer, :tile, :state, :reason, :drives, :vehicles, :sigma_m, :apart_m, :voxels, :alone,
+  :first_ns, :last_ns, :updated_ns, :base_version, :version, :codec_id, :body)
+ON CONFLICT (layer, tile) DO UPDATE SET state = excluded.state, reason = excluded.reason, drives = excluded.drives,
+  vehicles = excluded.vehicles, sigma_m = excluded.sigma_m, apart_m = excluded.apart_m, voxels = excluded.voxels,
+  alone = excluded.alone, first_ns = excluded.first_ns, last_ns = excluded.last_ns, updated_ns = excluded.updated_ns,
+  version = excluded.version, codec_id = excluded.codec_id, body = excluded.body
+
+-- name: waits_to_be_merged
+SELECT 1 FROM dirty WHERE layer = :layer AND tile = :tile
