@@ -10,6 +10,7 @@ from gnd.cloud_merger.features.parameters import FeatureMergeParameters, gate_of
 from gnd.cloud_merger.features.rls import PlaceEstimate
 from gnd.cloud_merger.features.shapes import across
 from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features.lane_pieces import beside, is_lane_piece, left_of
 
 FEATURE_LINE_REACH_M: Final = 1.5
 """The same for polylines, across the line: less than half the width of a lane."""
@@ -72,6 +73,9 @@ def _offsets(measured: Sequence[PlaceEstimate], known: Sequence[PlaceEstimate]) 
 
 def _beside(line_m: F64, other_m: F64) -> tuple[F64, float]:
     """Mean and largest displacement between two polylines of which one lies beside at least half of the other."""
+    if is_lane_piece(line_m) and is_lane_piece(other_m):
+        overlap, left_m = beside(line_m, other_m)
+        return (np.zeros(3), np.inf) if overlap < _LEAST_OVERLAP else (left_m * left_of(line_m), abs(left_m))
     there, back = across(line_m, other_m), across(other_m, line_m)
     if max(there[2], back[2]) < _LEAST_OVERLAP:
         return np.zeros(3), np.inf

@@ -12,6 +12,7 @@ import numpy as np
 from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
 from gnd.cloud_merger.features.drive_shift import DriveShift
 from gnd.cloud_merger.features.existence import prior_of, verdict
+from gnd.cloud_merger.features.lanes_shift import LateralShift
 from gnd.cloud_merger.features.memory import Own, Vote
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.features.rls import PlaceEstimate, balanced, estimate, fused, is_even, step
@@ -20,6 +21,7 @@ from gnd.cloud_merger.features.statements import Attributes
 from gnd.cloud_merger.features.tracks import FeatureTrack, Measured
 from gnd.gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile
 from gnd.gnd_map.features.feature import MAX_COUNT
+from gnd.gnd_map.features.lane_pieces import is_lane_piece
 from gnd.gnd_map.tile_id import TileId
 
 FEATURE_VOTERS: Final = 6
@@ -96,9 +98,8 @@ class Story:
         self._prior = prior_of(track)
         self.masses = self._prior
         self._state: PlaceEstimate | None = self.known
-        self._shift = DriveShift()
-        if self.known is not None and track.is_point:
-            self._shift.add(self.known, self._known_drives)
+        self._shift: DriveShift | LateralShift
+        self._begin_shift()
         self._is_stale = bool(self.measured)
         self._longest_m = max((length_of(place.points_m) for place in self._places()), default=0.0)
         self._least_m2 = {vehicle: self._fused(own).least_m2 for vehicle, own in self.measured.items()}
@@ -211,9 +212,7 @@ class Story:
         if self._is_stale or self._state is None:
             each = list(self.balanced().values())
             self._state, self._is_stale = self._estimate(list(each)), False
-            self._shift = DriveShift()
-            if self.known is not None and self.track.is_point:
-                self._shift.add(self.known, self._known_drives)
+            self._begin_shift()
             self._shift_by(each)
         return self._state
 
@@ -223,9 +222,14 @@ class Story:
         epoch = self.track.epoch
         return max(self.vehicles_before + (0 if epoch is None else epoch.vehicles), 1)
 
-    def _shift_by(self, places: Iterable[PlaceEstimate]) -> None:
-        for place in places if self.track.is_point else ():
-            self._shift.add(place)
+    def _begin_shift(self) -> None:
+        """Begin to compare drives: points in two dimensions, pieces of lines across; other polylines not at all."""
+        self._shift = LateralShift() if is_lane_piece(self.track.state.points_m) else DriveShift()
+        self._shift_by([] if self.known is None else [self.known], self._known_drives)
+
+    def _shift_by(self, places: Iterable[PlaceEstimate], drives: int = 1) -> None:
+        for place in places if len(self.track.state.points_m) <= 2 else ():
+            self._shift.add(place, drives)
 
     def balanced(self) -> dict[str, PlaceEstimate]:
         """What the measurements of each vehicle say together, and weigh beside those of the others."""

@@ -4,18 +4,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features.lane_pieces import is_lane_piece
 
 
 def onto(points_m: F64, other_m: F64) -> F64:
     """For each of `points_m` (N, 3) the place that answers to it on `other_m` (M, 3), seen from above.
 
     A point answers to a point. On a polyline it is the foot of the perpendicular; a vertex beyond the polyline's ends
-    has none and stays where it is, so that nothing is learnt of it.
+    has none and stays where it is, so that nothing is learnt of it. A piece of a line (two vertices) goes on straight.
     """
     if len(other_m) == 1:
         return np.broadcast_to(other_m, points_m.shape)
+    if is_lane_piece(points_m) and is_lane_piece(other_m):
+        return _on_straight(points_m, other_m)
     feet, inside = _feet(points_m, other_m)
     return np.where(inside[:, None], feet, points_m)
+
+
+def _on_straight(points_m: F64, line_m: F64) -> F64:
+    """(N, 3) feet on the straight line through two vertices, horizontally."""
+    along = line_m[1] - line_m[0]
+    share = (points_m - line_m[0])[:, :2] @ along[:2] / max(float(along[:2] @ along[:2]), 1e-12)
+    return np.asarray(line_m[0] + share[:, None] * along)
 
 
 def across(points_m: F64, other_m: F64) -> tuple[F64, float, float]:

@@ -12,7 +12,9 @@ from gnd.cloud_merger.features.memory import LayerMemory, Own, Remembered, Vote
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.features.rls import PlaceEstimate, step
 from gnd.cloud_merger.features.statements import Attributes, Claimed, Statement
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import Feature, feature_id_of
+from gnd.gnd_map.features.lane_pieces import is_lane_piece, left_of
 from gnd.schemas.feature_change import Seen
 
 FEATURE_MOVED_M: Final = 0.3
@@ -184,9 +186,9 @@ class FeatureTracks:
         is decided when all have been heard (`settle`).
         """
         track.votes[report] = Vote(statement.vehicle, seen.existence, seen.hits)
-        if seen.position_m is None or seen.cov_m2 is None or len(track.state.points_m) > 1:
+        if seen.position_m is None or seen.cov_m2 is None or len(track.state.points_m) > 2:
             return None
-        place = PlaceEstimate.of(seen.position_m[None], seen.cov_m2)
+        place = PlaceEstimate.of(_seen_at(track.state.points_m, seen.position_m), seen.cov_m2)
         if fits(place, track.state, self._parameters):
             track.measure(report, Measured(statement.vehicle, place, False, ()), self._parameters)
             return None
@@ -305,6 +307,14 @@ class FeatureTracks:
             early.state = _place_of(known)
         for number, one in measured:
             early.measure(number, one, self._parameters)
+
+
+def _seen_at(points_m: F64, position_m: F64) -> F64:
+    """The points of a feature measured at a position; a piece of a line moves there as a whole, its middle first."""
+    if not is_lane_piece(points_m):
+        return position_m[None]
+    left = left_of(points_m)
+    return np.asarray(points_m + (position_m - points_m.mean(axis=0)) @ np.outer(left, left))
 
 
 def _may_be_one(a: FeatureTrack, b: FeatureTrack) -> bool:
