@@ -1,11 +1,12 @@
 """A production camera that detects traffic signs on a simulated street: what it reports in each look.
 
-What hides a sign is found by casting rays at its plate through everything that stands and moves there. Noise is that
-of Kim et al. 2018, Table 1, at a level that fits cameras of series cars; field of view and rate are those of Jo et al.
-2018, section 6.1. A plate is found from either side.
+What hides a sign is found by casting rays at its plate through everything that stands and moves there. White noise is
+that of Kim et al. 2018, Table 1, at a level that fits cameras of series cars, and on top comes what averaging over the
+looks of a passage does not remove (`roads/hard_noise.py`); field of view and rate are those of Jo et al. 2018, section
+6.1. A plate is found from either side.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import pi, radians
 from typing import Final
 
@@ -16,6 +17,7 @@ from gnd.fleet_sim.errors import DriveSimError
 from gnd.fleet_sim.feature_truth import KIND_OF, LAYER_OF, facing_street, plate_of, position_street_m
 from gnd.fleet_sim.movers import Movers
 from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.roads.hard_noise import HardNoise, erring
 from gnd.fleet_sim.shapes import Block
 from gnd.fleet_sim.trajectory import Motion
 from gnd.fleet_sim.world import State, World
@@ -26,6 +28,13 @@ FloatArray = NDArray[np.float64]
 
 _NS_PER_S: Final = 1_000_000_000
 _STREAM: Final = 62
+_HARD_STREAM: Final = 63
+_LOOKALIKE_STREAM: Final = 64
+_LOOKALIKE: Final = "looks like a sign"
+_LOOKALIKE_PLATE: Final = (0.3, 0.3, 2.5)
+"""Half width, half height and height of the middle of what looks like a sign [m]: an advert, a house number."""
+_LOOKALIKE_LEFT_M: Final = (6.0, 8.5)
+"""How far to either side of the middle of the road such things hang."""
 BEARING_DEG: Final = 2.5
 HEIGHT_SHARE: Final = 0.5
 """Height noise for level 1 [m]."""
@@ -48,6 +57,8 @@ class SignCamera:
         width_deg, range_m: field of view about the vehicle's origin, as its detections are given.
         rate_hz: looks a second.
         mount_m: where it sits: x ahead of the vehicle's origin, y left, z up.
+        hard: what it errs by besides, of which no detection says anything; None: white noise is all, and any visible
+            sign is missed in `miss_rate` of the looks.
     """
 
     level: float = 0.7
@@ -57,6 +68,7 @@ class SignCamera:
     range_m: float = 80.0
     rate_hz: int = 15
     mount_m: tuple[float, float, float] = (1.8, 0.0, 1.3)
+    hard: HardNoise | None = field(default_factory=HardNoise)
 
     def __post_init__(self) -> None:
         if not (self.level > 0 and 0 <= self.miss_rate < 1 and self.false_alarms >= 0 and self.rate_hz >= 1):
@@ -72,7 +84,9 @@ class SignCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Signs:
-    """S signs of a state: name, aims float64 (S, A, 3) in the map frame, first and last primitive of each."""
+    """S signs of a state, and what looks like one: name, aims float64 (S, A, 3) in the map frame, first and last
+    primitive of each (both -1 of a look-alike, which is no object of the world).
+    """
 
     names: tuple[str, ...]
     aims_map_m: FloatArray
@@ -85,7 +99,7 @@ class Sightings:
     """What the camera could see: L looks, S signs.
 
     Attributes:
-        names: of the signs.
+        names: of the signs, and of what looks like one.
         polar: float64 (L, S, 3), true range [m], bearing [rad] and height [m] about the vehicle's origin.
         in_view: bool (L, S).
         visible: bool (L, S), in view and not hidden.
@@ -95,6 +109,11 @@ class Sightings:
     polar: FloatArray
     in_view: NDArray[np.bool_]
     visible: NDArray[np.bool_]
+
+    @property
+    def is_sign(self) -> NDArray[np.bool_]:
+        """Which are signs, bool (S,); the others only look like one."""
+        return np.array([name != _LOOKALIKE for name in self.names], np.bool_)
 
 
 def sightings(
@@ -111,7 +130,7 @@ def sightings(
         motion: of the vehicle.
         t_s: times of the looks in the motion's time, float64 (L,).
     """
-    signs = _signs(world, state)
+    signs = _signs(world, state, camera.hard)
     T_map_vehicle = motion.T_map_vehicle(t_s)
     middle = signs.aims_map_m[:, 0]
     T = T_inverse(T_map_vehicle)
@@ -126,7 +145,7 @@ def sightings(
     return Sightings(signs.names, np.stack([range_m, bearing, place[..., 2]], axis=2), in_view, visible)
 
 
-def _signs(world: World, state: State) -> _Signs:
+def _signs(world: World, state: State, hard: HardNoise | None) -> _Signs:
     names, aims, first, end, position = [], [], [], [], 0
     for o in world.in_state(state):
         if LAYER_OF.get(o.kind) == "signs":
@@ -135,8 +154,26 @@ def _signs(world: World, state: State) -> _Signs:
             first.append(position)
             end.append(position + len(o.shapes))
         position += len(o.shapes)
+    for points_street in () if hard is None else _lookalikes(world, hard):
+        names.append(_LOOKALIKE)
+        aims.append(world.map_of_street(points_street))
+        first.append(-1)
+        end.append(-1)
     points = np.array(aims).reshape(-1, len(_AIMS), 3)
     return _Signs(tuple(names), points, np.array(first, dtype=np.int64), np.array(end, dtype=np.int64))
+
+
+def _lookalikes(world: World, hard: HardNoise) -> FloatArray:
+    """Points on what looks like a sign, float64 (N, A, 3), street frame: the same for all drives along the street."""
+    rng = np.random.default_rng([world.seed, _LOOKALIKE_STREAM])
+    half_m = world.half_length_m
+    count = int(rng.poisson(hard.lookalikes_per_km * 2.0 * half_m / 1000.0))
+    half_wide, half_high, height_m = _LOOKALIKE_PLATE
+    middle = np.full((count, 3), height_m)
+    middle[:, 0] = rng.uniform(-half_m, half_m, count)
+    middle[:, 1] = rng.uniform(*_LOOKALIKE_LEFT_M, count) * rng.choice((-1.0, 1.0), count)
+    aims = _AIMS[:, :1] * [0.0, half_wide, 0.0] + _AIMS[:, 1:] * [0.0, 0.0, half_high]
+    return np.asarray(middle[:, None] + aims)
 
 
 def _aims(plate: Block, middle: FloatArray) -> FloatArray:
@@ -184,9 +221,9 @@ def _movers_m(
 def looks_of(camera: SignCamera, seen: Sightings, t_ns: NDArray[np.int64], seed: tuple[int, int]) -> list[Detections]:
     """Return what the camera reports at times int64 (L,), one item a look, those without a sign too."""
     rng = np.random.default_rng([*seed, _STREAM])
-    shape = seen.visible.shape
-    hit = seen.visible & (rng.random(shape) >= camera.miss_rate)
-    noisy = seen.polar + camera.sigmas * rng.standard_normal((*shape, 3))
+    hit, noisy = _kindly(camera, seen, rng)
+    if camera.hard is not None:
+        hit, noisy[..., :2] = _hardly(camera, camera.hard, seen, np.random.default_rng([*seed, _HARD_STREAM]))
     alarms = rng.poisson(camera.false_alarms, len(t_ns))
     looks = []
     for row in range(len(t_ns)):
@@ -194,6 +231,29 @@ def looks_of(camera: SignCamera, seen: Sightings, t_ns: NDArray[np.int64], seed:
         rows = np.concatenate([noisy[row, hit[row]], false])
         looks.append(_look(camera, int(t_ns[row]), rows[rng.permutation(len(rows))]))
     return looks
+
+
+def _kindly(camera: SignCamera, seen: Sightings, rng: np.random.Generator) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which signs each look detects, bool (L, S), and where, float64 (L, S, 3): white noise is all."""
+    shape = seen.visible.shape
+    hit = seen.visible & seen.is_sign & (rng.random(shape) >= camera.miss_rate)
+    return hit, seen.polar + camera.sigmas * rng.standard_normal((*shape, 3))
+
+
+def _hardly(
+    camera: SignCamera, hard: HardNoise, seen: Sightings, rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which signs and look-alikes each look of a drive detects, bool (L, S), and where, float64 (L, S, 2). The layer
+    of a street has one kind: none is confused.
+    """
+    range_m, bearing = seen.polar[..., 0], seen.polar[..., 1]
+    count = len(seen.names)
+    rate = rng.uniform(hard.least_seen, 1.0, count)
+    is_taken = rng.random(count) < hard.lookalike_seen
+    rate = np.where(seen.is_sign, rate, is_taken * rng.uniform(*hard.lookalike_rate, count))
+    hit = seen.visible & (rng.random(seen.visible.shape) < hard.detectable(range_m, camera.range_m) * rate)
+    stated = (float(camera.sigmas[0]), float(camera.sigmas[1]))
+    return hit, np.stack(erring((range_m, bearing), stated, camera.mount_m[2], hard, rng), axis=2)
 
 
 def _false_alarms(camera: SignCamera, count: int, rng: np.random.Generator) -> FloatArray:

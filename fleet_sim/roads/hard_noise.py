@@ -84,9 +84,9 @@ class HardNoise:
         if self.miss_far < self.miss_near or self.lookalike_rate[0] > self.lookalike_rate[1]:
             raise RoadError(f"misses {self.miss_near} … {self.miss_far}, rates {self.lookalike_rate}: they must rise")
 
-    def detectable(self, range_m: FloatArray, view: CameraView) -> FloatArray:
-        """Return the chance of a detection at ranges, of what is visible."""
-        share = np.minimum(range_m / view.range_m, 1.0) ** 2
+    def detectable(self, range_m: FloatArray, reach_m: float) -> FloatArray:
+        """Return the chance of a detection at ranges, of what is visible, by a sensor that sees so far."""
+        share = np.minimum(range_m / reach_m, 1.0) ** 2
         return np.asarray(1.0 - self.miss_near - (self.miss_far - self.miss_near) * share)
 
 
@@ -150,7 +150,7 @@ def hard_looks(
     words = sorted(set(route.features.kinds)) or ["false"]
     there = _joined(_signs(route, hard, words, standing, rng), _lookalikes(route, view, hard, poses, placed, rng))
     range_m, bearing = _measured(view, noise, hard, there, rng)
-    hit = there.visible & (rng.random(there.visible.shape) < hard.detectable(there.range_m, view) * there.rate)
+    hit = there.visible & (rng.random(there.visible.shape) < hard.detectable(there.range_m, view.range_m) * there.rate)
     kind = _kinds(there, len(words), hit.shape, rng)
     alarms = rng.poisson(noise.false_alarms, len(t_ns))
     looks, truth = [], []
@@ -204,14 +204,8 @@ def _measured(
     view: CameraView, noise: DetectorNoise, hard: HardNoise, there: Standing, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Ranges and bearings (L, N): what stays with the drive, what stays with each sign, and what is white."""
-    shape, count = there.visible.shape, len(there.feature_id)
-    scale, pitch = hard.range_share * rng.standard_normal(), hard.pitch_rad * rng.standard_normal()
-    yaw, white = hard.yaw_rad * rng.standard_normal(), np.exp(hard.white_ln_sigma * rng.standard_normal())
-    share = np.maximum(1.0 + scale + hard.sign_range_share * rng.standard_normal(count), 0.5)
-    turn = yaw + hard.sign_bearing_rad * rng.standard_normal(count)
-    range_m = there.range_m * share + pitch * there.range_m**2 / view.eye_m
-    range_m = np.abs(range_m + white * noise.sigma_range_m * rng.standard_normal(shape))
-    return range_m, there.bearing_rad + turn + white * noise.sigma_bearing_rad * rng.standard_normal(shape)
+    polar, sigmas = (there.range_m, there.bearing_rad), (noise.sigma_range_m, noise.sigma_bearing_rad)
+    return erring(polar, sigmas, view.eye_m, hard, rng)
 
 
 def _kinds(there: Standing, words: int, shape: tuple[int, ...], rng: np.random.Generator) -> IntArray:
@@ -221,6 +215,27 @@ def _kinds(there: Standing, words: int, shape: tuple[int, ...], rng: np.random.G
     wrong = rng.random(shape) < there.other_kind
     aside = rng.choice((-1, 1), shape)
     return np.asarray(np.where(wrong, (there.kind + aside) % words, there.kind), np.int64)
+
+
+def erring(
+    polar: tuple[FloatArray, FloatArray],
+    sigmas: tuple[float, float],
+    eye_m: float,
+    hard: HardNoise,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Return ranges and bearings (L, N) as a camera at a height measures the true ones (L, N) of N objects in one
+    drive; `sigmas` are those of range [m] and bearing [rad] that its detector states.
+    """
+    (true_m, true_rad), (sigma_m, sigma_rad) = polar, sigmas
+    shape, count = true_m.shape, true_m.shape[1]
+    scale, pitch = hard.range_share * rng.standard_normal(), hard.pitch_rad * rng.standard_normal()
+    yaw, white = hard.yaw_rad * rng.standard_normal(), np.exp(hard.white_ln_sigma * rng.standard_normal())
+    share = np.maximum(1.0 + scale + hard.sign_range_share * rng.standard_normal(count), 0.5)
+    turn = yaw + hard.sign_bearing_rad * rng.standard_normal(count)
+    range_m = true_m * share + pitch * true_m**2 / eye_m
+    range_m = np.abs(range_m + white * sigma_m * rng.standard_normal(shape))
+    return range_m, true_rad + turn + white * sigma_rad * rng.standard_normal(shape)
 
 
 def erring_profile(

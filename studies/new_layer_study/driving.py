@@ -10,6 +10,7 @@ import numpy as np
 from gnd.cloud_merger.features import merge_layer
 from gnd.fleet_sim.drives import EPOCH_NS
 from gnd.fleet_sim.roads.drive import RoadDrive, RoadDriveOptions, drive_route
+from gnd.fleet_sim.roads.hard_noise import HardNoise
 from gnd.fleet_sim.roads.looks import DetectorNoise
 from gnd.fleet_sim.roads.recording import items_of
 from gnd.fleet_sim.roads.route import Route
@@ -34,6 +35,7 @@ from studies.new_layer_study.layers import DriveLayers, Layer, LayerLocalised, L
 TRACK: Final = "track"
 MOTORWAY: Final = "motorway"
 STRAIGHT: Final = "straight"
+NOISES: Final = ("hard", "kind")
 CONFIDENCE: Final = 0.9
 """λ of a detector that misses one in ten."""
 _HOUR_NS: Final = 3_600 * 1_000_000_000
@@ -52,6 +54,7 @@ class RouteTask:
         beacon: noise level of the detector of point features.
         lane: noise level of the lane camera.
         gnss_bias_m: standard deviation of a drive's constant GNSS error, each axis.
+        noise: of `NOISES`.
     """
 
     kind: str
@@ -60,6 +63,7 @@ class RouteTask:
     beacon: float = 1.0
     lane: float = 1.0
     gnss_bias_m: float = 0.0
+    noise: str = "hard"
 
     @property
     def route(self) -> Route:
@@ -76,8 +80,8 @@ class RouteTask:
     @property
     def name(self) -> str:
         """What the progress bar says, and the folder."""
-        noise = "" if self.is_usual else f"-beacon-{self.beacon:g}-lane-{self.lane:g}"
-        return f"{self.kind}{noise}"
+        levels = "" if self.is_usual else f"-beacon-{self.beacon:g}-lane-{self.lane:g}"
+        return f"{self.kind}{levels}-{self.noise}"
 
 
 def drive_of(task: RouteTask, vehicle: int) -> RoadDrive:
@@ -85,6 +89,7 @@ def drive_of(task: RouteTask, vehicle: int) -> RoadDrive:
     options = RoadDriveOptions(
         points=DetectorNoise(level=task.beacon),
         lanes=DetectorNoise(level=task.lane, false_alarms=0.0),
+        hard=HardNoise() if task.noise == "hard" else None,
         length_m=1e3 * task.km if task.kind == TRACK and task.km else None,
         gnss_bias_m=task.gnss_bias_m,
         start_ns=EPOCH_NS + vehicle * _HOUR_NS,

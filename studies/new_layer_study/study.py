@@ -1,7 +1,7 @@
 """`gnd reproduce new-feature-layer`: drives in worker processes; what is kept stays."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +14,7 @@ from studies.frame.options import check, list_of, option, seeds
 from studies.frame.pool import Job
 from studies.new_layer_study.driving import (
     MOTORWAY,
+    NOISES,
     STRAIGHT,
     TRACK,
     RouteTask,
@@ -61,6 +62,12 @@ class NewLayerOptions:
         0.0, "Constant error of each motorway drive's GNSS, metres (one sigma).", "--gnss-bias", span=(0, 20)
     )
     straight_seeds: int = option(1, "The straight motorway, on so many of the seeds.", span=(0, None))
+    noise: str = option(
+        "hard",
+        "hard: errors that stay with each feature and each drive, misses by range, look-alikes; kind: the paper's white"
+        " noise of known sigma.",
+        known=NOISES,
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -175,24 +182,29 @@ def tasks_of(options: NewLayerOptions, seed: int, root: Path) -> SeedTasks:
     """Return all drives of a seed; the noise level 1 of both sensors is the usual track's."""
     home = root / f"seed-{seed}"
     tracks = [
-        RouteTask(TRACK, seed, options.lap_m / 1e3),
+        usual_track(options, seed),
         *(task for of in noisy_tracks(options, seed).values() for task in of.values()),
     ]
     kinds = (MOTORWAY, STRAIGHT) if seed in options.seeds[: options.straight_seeds] else (MOTORWAY,)
-    roads = [RouteTask(kind, seed, options.km, gnss_bias_m=options.gnss_bias_m) for kind in kinds]
+    roads = [RouteTask(kind, seed, options.km, gnss_bias_m=options.gnss_bias_m, noise=options.noise) for kind in kinds]
     numbers = dict.fromkeys(tracks, options.drives) | dict.fromkeys(roads, options.motorway_drives)
     routes = {task: tuple(MappingTask(task, n + 1, home) for n in range(many)) for task, many in numbers.items()}
     return SeedTasks(seed, routes, tuple(LocalisingTask(task, routes[task], home) for task in roads))
+
+
+def usual_track(options: NewLayerOptions, seed: int) -> RouteTask:
+    """Return the test track with both sensors at noise level 1."""
+    return RouteTask(TRACK, seed, options.lap_m / 1e3, noise=options.noise)
 
 
 def noisy_tracks(options: NewLayerOptions, seed: int) -> dict[str, dict[float, RouteTask]]:
     """Return the test track at each noise level of each sensor, the other's at 1."""
     if not options.levels or seed not in options.seeds[: options.sweep_seeds]:
         return {}
-    levels, km = sorted(options.levels), options.lap_m / 1e3
+    levels, usual = sorted(options.levels), usual_track(options, seed)
     return {
-        "beacon": {level: RouteTask(TRACK, seed, km, beacon=level) for level in levels},
-        "lane": {level: RouteTask(TRACK, seed, km, lane=level) for level in levels},
+        "beacon": {level: replace(usual, beacon=level) for level in levels},
+        "lane": {level: replace(usual, lane=level) for level in levels},
     }
 
 
@@ -217,7 +229,7 @@ def _read(options: NewLayerOptions, plan: SeedTasks) -> NewLayerSeed:
         for sensor, levels in noisy_tracks(options, plan.seed).items()
     }
     roads = {one.route.kind: _read_motorway(routes[one.route], one.kept) for one in plan.fresh}
-    track = routes[RouteTask(TRACK, plan.seed, options.lap_m / 1e3)]
+    track = routes[usual_track(options, plan.seed)]
     return NewLayerSeed(plan.seed, track, noisy, roads[MOTORWAY], roads.get(STRAIGHT))
 
 

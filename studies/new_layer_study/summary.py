@@ -145,7 +145,8 @@ def tables_of(found: Mapping[str, Any]) -> list[Sheet]:
 
 def _single(found: Mapping[str, Any]) -> Sheet:
     ours, radius = found["nfl"], found["matching_radius_m"]["track"]
-    title = f"Figure 6: test track, single drives, m; {ours['beacons']:.0f} beacons, pairs within {radius:g} m"
+    noise = found["parameters"]["noise"]
+    title = f"Figure 6: test track, {noise} noise, single drives, m; {ours['beacons']:.0f} beacons, within {radius:g} m"
     rows = {
         _LABELS[case]: ours["single"][case] | {"paper": f"{mean:g} ± {std:g}"}
         for case, (mean, std) in PAPER_SINGLE_M.items()

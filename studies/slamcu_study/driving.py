@@ -1,6 +1,6 @@
 """One drive along the motorway through the pipeline of a vehicle without LiDAR, and what is true of its reports."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Final
@@ -34,7 +34,16 @@ from gnd.vehicle_agent.sources.recording import first_fix
 from studies.feature_study.pipelines import TilesAtOnce, found_in, in_route_frame, joined, reports_of, tiles_of
 from studies.feature_study.truth import match_one_to_one
 from studies.frame.pool import Tick
-from studies.slamcu_study.signs import DELETED, NEW, NORMAL, PAPER_LAMBDA_HD, MergedSigns, SignTruth, Verdicts
+from studies.slamcu_study.signs import (
+    DELETED,
+    NEW,
+    NORMAL,
+    PAPER_LAMBDA_HD,
+    MeasuredSigns,
+    MergedSigns,
+    SignTruth,
+    Verdicts,
+)
 
 LIDAR_SIGMA: Final = (0.04, 0.04, np.radians(0.08))
 """Errors of the LiDAR localiser's poses, m, m, rad: as `--poses noisy:4cm:0.08deg` of the other studies."""
@@ -97,7 +106,7 @@ def driven_by(drive: RoadDrive, variant: str, vehicle: int, tick: Tick) -> Drive
     camera = _camera(drive, vehicle)
     tiles = TilesAtOnce({_SIGNS.name: sign_tiles(drive.route).values()})
     items = items_of(drive) if variant != "no_occlusion" else map(_without_occlusion, items_of(drive))
-    return _CameraDrive(drive, camera, tiles).run(items, tick)
+    return _CameraDrive(drive, camera, tiles, as_printed=variant == "eq_17").run(items, tick)
 
 
 def _camera(drive: RoadDrive, vehicle: int) -> Identity:
@@ -113,12 +122,12 @@ def _without_occlusion(item: DriveItem) -> DriveItem:
 class _CameraDrive:
     """A drive through `CameraPipeline`, which `gnd agent --localise-by slamcu` runs, observed on the way."""
 
-    def __init__(self, drive: RoadDrive, who: Identity, tiles: TilesAtOnce | None) -> None:
+    def __init__(self, drive: RoadDrive, who: Identity, tiles: TilesAtOnce | None, *, as_printed: bool = False) -> None:
         fix, _ = first_fix(items_of(drive), drive.route.name)
         parameters = PipelineParameters(features=FeatureParameters((_SIGNS,)))
         seed = int(who.vehicle.removeprefix("car-"))
         self.pipeline = CameraPipeline(fix, parameters, who, feature_tiles=tiles, seed=seed)
-        self._drive, self._known = drive, dict[int, KnownState]()
+        self._drive, self._known, self._as_printed = drive, dict[int, KnownState](), as_printed
 
     def run(self, items: Iterator[DriveItem], tick: Tick) -> Driven:
         """Drive to the end."""
@@ -128,6 +137,9 @@ class _CameraDrive:
             begun_s = perf_counter()
             outputs.append(pipeline.push(item))
             spent_s += perf_counter() - begun_s
+            if self._as_printed and pipeline.slamcu is not None:
+                pipeline.slamcu.weigh_as_printed()
+                self._as_printed = False  # once is enough
             if not isinstance(item, Detections):
                 continue
             seen += 1
@@ -283,9 +295,31 @@ def merged_signs(route: Route, reports: Sequence[FeatureReport]) -> MergedSigns:
     base = {tile: one.features for tile, one in sign_tiles(route).items()}
     before = {one.feature_id for features in base.values() for one in features}
     merged = {tile: one.features for tile, one in merge_layer(base, reports).items()}
-    known = sorted(one.feature_id for features in merged.values() for one in features if one.feature_id in before)
+    known = _joined_signs(
+        (one.feature_id, in_route_frame(route.frame, tile, [(one.position_m, one.cov_m2)]))
+        for tile, features in merged.items()
+        for one in features
+        if one.feature_id in before
+    )
     places = joined(
         in_route_frame(route.frame, tile, [(f.position_m, f.cov_m2) for f in features if f.feature_id not in before])
         for tile, features in merged.items()
     )
-    return MergedSigns(np.array(known, np.int64), *places)
+    return MergedSigns(known.feature_id, *places, known)
+
+
+def measured_signs(route: Route, reports: Sequence[FeatureReport]) -> MeasuredSigns:
+    """Return the signs of the map as one vehicle's reports have them, independently of the map."""
+    return _joined_signs(
+        (one.feature_id, in_route_frame(route.frame, change.tile, [(one.position_m, one.cov_m2)]))
+        for report in reports
+        for change in report.tiles
+        for one in change.seen
+        if one.position_m is not None and one.cov_m2 is not None
+    )
+
+
+def _joined_signs(signs: Iterable[tuple[int, tuple[F64, F64]]]) -> MeasuredSigns:
+    """Signs with their places (1, 2), (1, 2, 2), in the order of their ids."""
+    by_id = sorted(signs, key=lambda one: one[0])
+    return MeasuredSigns(np.array([one[0] for one in by_id], np.int64), *joined(place for _, place in by_id))

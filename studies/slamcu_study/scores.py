@@ -25,6 +25,7 @@ from studies.slamcu_study.signs import (
     TRUE_CLASSES,
     U8,
     VARIANTS,
+    MeasuredSigns,
     MergedSigns,
     SignTruth,
     SlamcuSeed,
@@ -166,9 +167,11 @@ def seed_summary(outcome: SlamcuSeed) -> dict[str, Any]:
     truth = outcome.truth
     found = drive_summary(outcome.first, truth)
     found["all_drives"] = _of_all([scored_drive(drive, truth) for drive in outcome.drives])
+    found["known_signs"] = known_plain(outcome.measured, truth)
     for vehicles, merged in outcome.merged.items():
         scored = merged_score(merged, truth)
         found[f"position_error_{vehicles}_m"] = scored.plain_errors() | {"nees": _nees(scored)}
+        found[f"known_signs_{vehicles}"] = known_plain([merged.known], truth)
         found[f"accuracy_{vehicles}"] = accuracy_of(scored.confusion)
     found["ablation"] = {name: _ablation(one, truth) for name, one in outcome.variants.items()}
     return found
@@ -209,6 +212,21 @@ def merged_score(merged: MergedSigns, truth: SignTruth) -> SignScore:
     ids = truth.feature_id[truth.true_class != NEW]
     predicted = np.where(np.isin(ids, merged.known_id), NORMAL, DELETED).astype(np.uint8)
     return score(truth, (ids, predicted), (merged.new_xy_m, merged.new_cov_m2))
+
+
+def known_plain(measured: Sequence[MeasuredSigns], truth: SignTruth) -> dict[str, Any]:
+    """Return errors and NEES of signs that stand as mapped, as vehicles measured them or a map has them."""
+    normal = truth.of(NORMAL)
+    row = dict(zip(truth.feature_id[normal].tolist(), normal.tolist(), strict=True))
+    errors, covs = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+    for one in measured:
+        stands = np.isin(one.feature_id, truth.feature_id[normal])
+        rows = np.array([row[number] for number in one.feature_id[stands].tolist()], np.int64)
+        errors.append(one.xy_m[stands] - truth.xy_m[rows])
+        covs.append(one.cov_m2[stands])
+    error_m = np.concatenate(errors)
+    honesty = Honesty.of(error_m, np.concatenate(covs))
+    return distances_plain(np.hypot(*error_m.T)) | {"nees": None if honesty is None else honesty.plain()}
 
 
 def _nees(scored: SignScore) -> dict[str, Any] | None:
@@ -292,7 +310,7 @@ def _ablation(found: Verdicts, truth: SignTruth) -> Mapping[str, Any]:
 Found = Mapping[str, Any]
 _ERRORS: Final = {
     "mean": "{mean:.3f}", "± std": "{std:.3f}", "p95": "{p95:.3f}", "found": "{found:.4g}", "missed": "{missed:.4g}",
-    "false": "{false:.4g}",
+    "false": "{false:.4g}", "NEES (2)": "{nees.mean:.2f}",
 }  # fmt: skip
 _ABLATION: Final = {
     **{f"{name} %": f"{{accuracy.{name}:.2f}}" for name in (*TRUE_CLASSES, "overall")},
@@ -310,6 +328,7 @@ _FACTS: Final = {
     "NEES of new signs (2 expected) / within their 95 %": (
         "{position_error_m.nees.mean:.2f} / {position_error_m.nees.within_95:.0%}"
     ),
+    "the same of signs as mapped": "{known_signs.nees.mean:.2f} / {known_signs.nees.within_95:.0%}",
 }
 
 
@@ -319,7 +338,8 @@ def tables_of(found: Found) -> list[Sheet]:
     rows = {VARIANTS[name]: row for name, row in ours["ablation"].items()}
     ablation = sheet_of("what matters: the first drive once more", _ABLATION, rows)
     targets = targets_sheet(found["targets"], f"targets, mean of {seeds}")
-    return [_confusion(ours, seeds), _positions(found, ours), ablation, _facts(found, ours), targets]
+    whose = f"{seeds}, {found['parameters']['noise']} noise"
+    return [_confusion(ours, whose), _positions(found, ours), ablation, _facts(found, ours), targets]
 
 
 def _confusion(ours: Found, seeds: str) -> Sheet:
@@ -349,6 +369,9 @@ def _facts(found: Found, ours: Found) -> Sheet:
     spread = "{distribution.mean:.2f} / {distribution.median:.2f} / {distribution.p5:.2f} / {distribution.worst:.2f} %"
     table.add("right, first drives: mean / median / 5 % / worst", shown(spread, ours))
     table.add("false new signs a drive", shown("{false_new_per_drive:.2f}", ours))
+    for name in ours:
+        if name.startswith("accuracy_") and name[9:].isdecimal():
+            table.add(f"right, {name[9:]} vehicles merged", shown(f"{{{name}.overall:.2f}} %", ours))
     table.add("worst first drive", shown("{worst.accuracy:.2f} % (seed {worst.seed})", found))
     table.add("drives that found they had been lost", shown("{lost} of {drives}", found))
     table.add("drives lost without knowing", shown("{lost_without_knowing} of {drives}", found))

@@ -30,6 +30,7 @@ VARIANTS: Final[Mapping[str, str]] = {
     "no_occlusion": "hidden signs counted as unseen",
     "no_rbpf": "pose of GNSS and dead reckoning",
     "lidar": "pose of the LiDAR localiser",
+    "eq_17": "signs of the map weigh at each look, Eq. 17",
 }
 """The first is the method; the others show what matters."""
 
@@ -109,6 +110,21 @@ class Verdicts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MeasuredSigns:
+    """Where signs of the map are by one drive alone, or by a map: K of them.
+
+    Attributes:
+        feature_id: int64 (K,).
+        xy_m: float64 (K, 2), map frame.
+        cov_m2: float64 (K, 2, 2).
+    """
+
+    feature_id: I64
+    xy_m: F64
+    cov_m2: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MergedSigns:
     """The layer that the cloud publishes after all drives.
 
@@ -116,11 +132,13 @@ class MergedSigns:
         known_id: int64 (K,), signs of the map before that are still published.
         new_xy_m: float64 (J, 2), published signs that the map before had not, map frame.
         new_cov_m2: float64 (J, 2, 2).
+        known: where the K signs are published.
     """
 
     known_id: I64
     new_xy_m: F64
     new_cov_m2: F64
+    known: MeasuredSigns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,6 +151,7 @@ class SlamcuSeed:
         variants: verdicts of the first vehicle, by variant.
         drives: verdicts of each vehicle; the first as in `variants`.
         merged: by number of vehicles.
+        measured: signs of the map as each vehicle measured them by itself.
     """
 
     seed: int
@@ -140,6 +159,7 @@ class SlamcuSeed:
     variants: Mapping[str, Verdicts]
     drives: tuple[Verdicts, ...]
     merged: Mapping[int, MergedSigns]
+    measured: tuple[MeasuredSigns, ...]
 
     @property
     def first(self) -> Verdicts:

@@ -9,12 +9,14 @@ from gnd.fleet_sim.drives import EPOCH_NS
 from gnd.fleet_sim.roads.drive import RoadDriveOptions, drive_route
 from gnd.fleet_sim.roads.hard_noise import HardNoise
 from gnd.fleet_sim.roads.motorway import motorway
+from gnd.fleet_sim.roads.route import Route
+from gnd.schemas.features import FeatureReport
 from studies.feature_study.pipelines import read_reports, write_reports
 from studies.frame.command import Bench, StudyReport, study
 from studies.frame.kept import Kept, key_of, sources_sha
 from studies.frame.options import check, option, seeds
 from studies.frame.pool import Job, Tick
-from studies.slamcu_study.driving import driven_by, merged_signs, sign_truth, verdicts_of
+from studies.slamcu_study.driving import driven_by, measured_signs, merged_signs, sign_truth, verdicts_of
 from studies.slamcu_study.faults import FAULTS, with_faults
 from studies.slamcu_study.scores import summary_of, tables_of
 from studies.slamcu_study.signs import FULL, VARIANTS, MergedSigns, SignTruth, SlamcuSeed, Verdicts
@@ -150,12 +152,13 @@ def _read(seed: int, options: SlamcuOptions, tasks: list[DriveTask]) -> SlamcuSe
     fleet = [task for task in tasks if task.variant == FULL]
     found = {task.variant: verdicts for task, (verdicts, _) in read.items() if task.vehicle == 1}
     drives = tuple(read[task][0] for task in fleet)
-    return SlamcuSeed(seed, read[fleet[0]][1], found, drives, _merged(seed, options, fleet))
-
-
-def _merged(seed: int, options: SlamcuOptions, fleet: list[DriveTask]) -> Mapping[int, MergedSigns]:
-    """What is published after 2, 5 and all drives."""
     route, reports = motorway(seed, 1e3 * options.km), [read_reports(task.reports) for task in fleet]
+    measured = tuple(measured_signs(route, of_drive) for of_drive in reports)
+    return SlamcuSeed(seed, read[fleet[0]][1], found, drives, _merged(route, options, reports), measured)
+
+
+def _merged(route: Route, options: SlamcuOptions, reports: list[list[FeatureReport]]) -> Mapping[int, MergedSigns]:
+    """What is published after 2, 5 and all drives."""
     return {
         n: merged_signs(route, [report for of_drive in reports[:n] for report in of_drive])
         for n in sorted({2, 5, options.drives})

@@ -15,6 +15,7 @@ from gnd.fleet_sim.feature_truth import feature_truth
 from gnd.fleet_sim.movers import Mover, Movers
 from gnd.fleet_sim.prepare import agent_configs, mapping_configs
 from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.roads.hard_noise import HardNoise
 from gnd.fleet_sim.trajectory import DrivingStyle, lane_motion
 from gnd.fleet_sim.world import State, World, WorldObject
 from gnd.schemas.drive import Detections, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
@@ -23,7 +24,8 @@ from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
 
 BOTH: tuple[State, ...] = ("before", "after")
-QUIET = SignCamera(level=1e-6, miss_rate=0.0, false_alarms=0.0)
+QUIET = SignCamera(level=1e-6, miss_rate=0.0, false_alarms=0.0, hard=None)
+KIND = SignCamera(hard=None)
 SHORT = DriveConfig(vehicle="v-1", sensor="VLP-16", seed=3, scans=8)
 STYLE = DrivingStyle(9.0, 1.0, 2.5, 0.0, 0.5, 0.0, 0.0, 60.0, 0.0, (0.0,) * 9)
 
@@ -84,17 +86,17 @@ def simulated(street_1: World, config: DriveConfig) -> DriveSimulation:
 
 
 def test_looks_are_those_of_a_camera(street_1: World) -> None:
-    simulation = simulated(street_1, replace(SHORT, scans=None, camera=SignCamera()))
-    found = simulation.sightings(SignCamera())
+    simulation = simulated(street_1, replace(SHORT, scans=None, camera=KIND))
+    found = simulation.sightings(KIND)
     times = np.arange(len(found.visible), dtype=np.int64)
-    looks = looks_of(SignCamera(false_alarms=0.0), found, times, (3, 1))
+    looks = looks_of(replace(KIND, false_alarms=0.0), found, times, (3, 1))
     assert len(looks) > 250
     assert sum(map(len, looks)) / found.visible.sum() == pytest.approx(0.9, abs=0.02)
     range_m, bearing = found.polar[..., 0][found.in_view], found.polar[..., 1][found.in_view]
     assert range_m.max() <= 80.0
     assert np.abs(bearing).max() <= radians(20.0)
     assert 0.5 < found.visible.sum() / found.in_view.sum() < 1.0, "houses, trees and parked cars hide some"
-    late = looks_of(SignCamera(miss_rate=0.0, false_alarms=0.0), found, times, (3, 1))
+    late = looks_of(replace(KIND, miss_rate=0.0, false_alarms=0.0), found, times, (3, 1))
     off = [np.sort(look.range_m) - np.sort(found.polar[k, found.visible[k], 0]) for k, look in enumerate(late)]
     assert np.concatenate(off).std() < 0.75, "sorted: at most the noise"
     noisy = looks_of(replace(QUIET, false_alarms=0.5), found, times, (3, 1))
@@ -116,6 +118,57 @@ def test_without_noise_detections_lie_on_the_signs(street_1: World) -> None:
         away = np.linalg.norm((places @ T[:3, :3].T + T[:3, 3])[:, None] - standing[None], axis=2).min(axis=1)
         assert len(look) >= 2
         assert away.max() < 0.01
+
+
+ONLY_HELD = HardNoise(
+    **dict.fromkeys(("yaw_rad", "range_share", "pitch_rad", "white_ln_sigma", "miss_near", "miss_far"), 0.0),
+    least_seen=1.0, lookalikes_per_km=0.0,
+)  # fmt: skip
+
+
+def test_errors_stay_with_a_sign_in_a_drive_and_are_others_in_the_next(street_1: World) -> None:
+    camera = replace(QUIET, hard=ONLY_HELD)
+    found = simulated(street_1, replace(SHORT, scans=None, camera=camera)).sightings(camera)
+    sign = slice(n := int(found.visible.sum(axis=0).argmax()), n + 1)
+    alone = Sightings(found.names[sign], found.polar[:, sign], found.in_view[:, sign], found.visible[:, sign])
+    rows, shares = np.flatnonzero(alone.visible[:, 0]), []
+    for seed in range(40):
+        looks = looks_of(camera, alone, np.arange(len(alone.visible), dtype=np.int64), (seed, 1))
+        of_drive = np.array([looks[k].range_m[0] / alone.polar[k, 0, 0] - 1.0 for k in rows])
+        assert of_drive.std() < 1e-4
+        shares.append(of_drive.mean())
+    assert np.std(shares) == pytest.approx(0.05, rel=0.4)
+
+
+def test_what_looks_like_a_sign_is_seen_in_some_looks_of_some_drives_and_hidden_like_one(street_1: World) -> None:
+    hard = replace(ONLY_HELD, sign_range_share=0.0, sign_bearing_rad=0.0, lookalikes_per_km=40.0)
+    camera = replace(QUIET, hard=hard)
+    found = simulated(street_1, replace(SHORT, scans=None, camera=camera)).sightings(camera)
+    kind = simulated(street_1, replace(SHORT, scans=None, camera=QUIET)).sightings(QUIET)
+    assert found.names[: len(kind.names)] == kind.names
+    assert np.array_equal(found.visible[:, : len(kind.names)], kind.visible)
+    alike = ~found.is_sign
+    assert alike.sum() >= 3
+    assert found.visible[:, alike].any()
+    assert (found.in_view & ~found.visible)[:, alike].any()
+    times = np.arange(len(found.visible), dtype=np.int64)
+    extra = [sum(map(len, looks_of(camera, found, times, (seed, 1)))) - kind.visible.sum() for seed in range(12)]
+    chance = hard.lookalike_seen * np.mean(hard.lookalike_rate)
+    assert np.mean(extra) == pytest.approx(chance * found.visible[:, alike].sum(), rel=0.5)
+    assert np.std(extra) > 0.0
+
+
+def test_far_signs_are_missed_more_often_than_near_ones(street_1: World) -> None:
+    found = simulated(street_1, replace(SHORT, scans=None, camera=SignCamera())).sightings(SignCamera())
+    times, near = np.arange(len(found.visible), dtype=np.int64), [0.0, 0.0]
+    for seed in range(6):
+        looks = looks_of(replace(SignCamera(), false_alarms=0.0), found, times, (seed, 1))
+        range_m = np.concatenate([look.range_m for look in looks])
+        near[0] += float((range_m < 30.0).sum())
+        near[1] += float((range_m > 60.0).sum())
+    true_m = found.polar[..., 0][found.visible]
+    seen = near[0] / (true_m < 30.0).sum(), near[1] / (true_m > 60.0).sum()
+    assert seen[0] > 1.2 * seen[1]
 
 
 def test_a_camera_disturbs_nothing_else_of_a_drive(street_1: World, tmp_path: Path) -> None:

@@ -40,6 +40,8 @@ class Noise:
     lane_m: float = 0.0
     lane_rad: float = 0.0
     miss: float = 0.0
+    held_share: float = 0.0
+    held_rad: float = 0.0
 
 
 PAPER = Noise(
@@ -123,11 +125,15 @@ def looks(
 ) -> tuple[Detections, ...]:
     """`extra`: (E, 3) time [s], range, bearing of false alarms."""
     found = []
+    own = np.zeros((len(truth.features), 2))  # what stays with each feature: share of its range, bearing
+    if noise.held_share or noise.held_rad:
+        own = rng.standard_normal(own.shape) * [noise.held_share, noise.held_rad]
     for t_ns in truth.t_ns[:: 50 // hz]:
         at = np.broadcast_to(truth.at(np.array([t_ns])), (len(truth.features), 3))
         seen = relative(at, np.column_stack([truth.features, np.zeros(len(at))]))[:, :2]
         reach = (np.hypot(*seen.T) < reach_m) & (rng.random(len(seen)) >= noise.miss)
-        polar = np.column_stack([np.hypot(*seen.T), np.arctan2(seen[:, 1], seen[:, 0])])[reach]
+        bearing, range_m = np.arctan2(seen[:, 1], seen[:, 0]) + own[:, 1], np.hypot(*seen.T) * (1.0 + own[:, 0])
+        polar = np.column_stack([range_m, bearing])[reach]
         polar = polar + rng.standard_normal(polar.shape) * [noise.range_m, noise.bearing]
         if extra is not None:
             polar = np.concatenate([polar, extra[np.abs(extra[:, 0] - (t_ns - T0_NS) * 1e-9) < 1e-6, 1:]])

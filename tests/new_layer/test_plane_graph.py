@@ -61,8 +61,12 @@ def logarithm(a, b):
 
 
 def errors(x, p):
-    pose, xy, c = x[: 3 * K].reshape(K, 3), x[3 * K : 3 * K + 2 * N].reshape(N, 2), x[3 * K + 2 * N :]
-    out = [c / [QUIET.motion.wheel_scale, QUIET.motion.gyro_bias_radps]]
+    pose, xy = x[: 3 * K].reshape(K, 3), x[3 * K : 3 * K + 2 * N].reshape(N, 2)
+    c, own = x[3 * K + 2 * N : 3 * K + 2 * N + 2], np.zeros((N, 2))
+    if p.held.any():
+        own = x[3 * K + 2 * N + 2 :].reshape(N, 2)
+    out = [(own / np.sqrt(p.held)).ravel()] if p.held.any() else []
+    out += [c / [QUIET.motion.wheel_scale, QUIET.motion.gyro_bias_radps]]
     off = relative(pose[:-1], pose[1:]) - p.steps.delta - p.steps.jacobian @ (c - p.calibration)
     out += [white(S) @ [d[0], d[1], wrapped(d[2])] for d, S in zip(off, p.steps.cov, strict=True)]
     g, t = QUIET.gnss, p.fixes.t_s
@@ -70,7 +74,8 @@ def errors(x, p):
     out += [white(dense) @ axis for axis in (pose[p.fixes.key, :2] - p.fixes.xy_m).T]
     for key, n, (bearing, distance), S in zip(*p.ties, strict=True):
         d = relative(pose[key], np.array([*xy[n], 0.0]))
-        out.append(white(S) @ [wrapped(np.arctan2(d[1], d[0]) - bearing), np.hypot(d[0], d[1]) - distance])
+        seen = np.arctan2(d[1], d[0]) + own[n, 1], np.hypot(d[0], d[1]) * (1.0 + own[n, 0])
+        out.append(white(S) @ [wrapped(seen[0] - bearing), seen[1] - distance])
     for key, base, o, information in zip(*p.lanes, strict=True):
         out.append(root_of(information) @ (logarithm(base, pose[key]) - o))
     out += [white(S) @ (xy[n] - place) for n, place, S in zip(*p.anchors, strict=True)]
@@ -78,21 +83,28 @@ def errors(x, p):
 
 
 def oracle(p, start):
-    x0 = np.concatenate([start.pose.ravel(), start.xy_m.ravel(), start.calibration])
+    own = np.zeros(2 * N if p.held.any() else 0)
+    x0 = np.concatenate([start.pose.ravel(), start.xy_m.ravel(), start.calibration, own])
     return least_squares(errors, x0, args=(p,), xtol=1e-14, ftol=1e-14, gtol=1e-12)
 
 
-def test_optimum_and_covariances_are_those_of_scipy():
+@pytest.mark.parametrize("held", [(0.0, 0.0), (0.05**2, 0.02**2)])
+def test_optimum_and_covariances_are_those_of_scipy(held):
+    """Without and with errors of range (share) and bearing that stay with each feature."""
     p, start = problem()
+    p = replace(p, held=np.array(held))
     found, expected = solve(p, start, QUIET), oracle(p, start)
     pose, xy = expected.x[: 3 * K].reshape(K, 3), expected.x[3 * K : 3 * K + 2 * N].reshape(N, 2)
     np.testing.assert_allclose(found.state.pose, pose, atol=1e-4)
     np.testing.assert_allclose(found.state.xy_m, xy, atol=1e-4)
-    np.testing.assert_allclose(found.state.calibration, expected.x[-2:], atol=1e-6)
+    first = 3 * K + 2 * N
+    np.testing.assert_allclose(found.state.calibration, expected.x[first : first + 2], atol=1e-6)
+    np.testing.assert_allclose(found.state.errors.ravel(), expected.x[first + 2 :], atol=1e-5)
     cov = np.linalg.inv(expected.jac.T @ expected.jac)
     for n in range(N):
         rows = slice(3 * K + 2 * n, 3 * K + 2 * n + 2)
         np.testing.assert_allclose(found.landmark_cov()[n], cov[rows, rows], rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(found.error_variance().ravel(), np.diag(cov)[first + 2 :], rtol=2e-3, atol=1e-8)
     for k in range(K):
         rows = slice(3 * k, 3 * k + 3)
         np.testing.assert_allclose(found.pose_cov(np.array([k]))[0], cov[rows, rows], rtol=5e-3, atol=1e-6)

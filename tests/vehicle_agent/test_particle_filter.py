@@ -107,6 +107,26 @@ def test_the_first_measurement_places_a_feature(held: tuple[float, float]) -> No
         assert np.allclose(full(particles.cov[0, k]), want[1], rtol=1e-3, atol=1e-5)
 
 
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_another_prior_is_that_of_a_filter_which_had_it_from_the_start(seed: int) -> None:
+    """Of a linear feature, as the information filter has it: Σ'⁻¹ = Σ⁻¹ + D'⁻¹ - D⁻¹ in the errors that stay."""
+    rng, m = np.random.default_rng(seed), 5
+    _, mean, cov = features_of(rng, m)
+    before, after = cov[:, [7, 9]].max(axis=0) * rng.uniform(1.2, 3.0, 2), rng.uniform(1e-4, 5e-2, 2)
+    new_mean, new_cov = measurement.with_prior(mean, cov, before, after)
+    for k in range(m):
+        information = np.linalg.inv(full(cov[k]))
+        changed = information + np.diag([0.0, 0.0, *(1.0 / after - 1.0 / before)])
+        if np.linalg.eigvalsh(changed)[0] <= 1e-6:
+            continue  # no prior of that size can have led here: the two errors go together too closely
+        assert np.allclose(full(new_cov[k]), np.linalg.inv(changed), rtol=1e-5, atol=1e-9)
+        assert np.allclose(new_mean[k], np.linalg.solve(changed, information @ mean[k]), rtol=1e-5, atol=1e-7)
+    same = measurement.with_prior(mean, cov, before, before)
+    assert np.allclose(same[0], mean)
+    assert np.allclose(same[1], cov)
+
+
 @pytest.mark.usefixtures("no_floor", "no_resampling")
 def test_settling_is_weighing_with_eq_17_when_the_map_has_no_error() -> None:
     """Ten measurements of a feature of the map: each weighed by Eq. (17), or compared with the map once, together."""
@@ -264,3 +284,56 @@ def test_parameters_out_of_range_are_refused() -> None:
         SlamcuParameters(detection_confidence=1.0)
     with pytest.raises(SlamcuParameterError, match="detection_confidence = nan"):
         SlamcuParameters(detection_confidence=float("nan"))
+
+
+def test_eq_17_is_the_line_of_the_paper_with_the_factor_that_it_lacks() -> None:
+    rng = np.random.default_rng(17)
+    pose, sign = np.stack([rng.normal(0, 2, 50), rng.normal(0, 2, 50), rng.normal(0, 0.1, 50)]), np.array([40.0, 5.0])
+    z, R = np.array([39.0, 0.1]), np.diag(VARIANCE)
+    got = measurement.map_log_likelihood(pose, sign, z, VARIANCE, np.zeros((2, 50)))
+    for k in range(50):
+        x, y, heading = pose[:, k]
+        off = np.arctan2(sign[1] - y, sign[0] - x) - heading
+        nu = z - np.array([np.hypot(sign[0] - x, sign[1] - y), off])
+        printed = float(nu @ np.linalg.inv(R) @ nu)  # (z - ẑ)ᵀ R⁻¹ (z - ẑ), what stands in the exponent
+        weight = np.linalg.det(2.0 * np.pi * R) ** -0.5 * np.exp(-0.5 * printed)
+        assert np.exp(got[k]) == pytest.approx(weight, rel=1e-9)
+    near_and_far = np.array([[1.0, 9.0], [1.0, 9.0], [0.0, 0.0]])
+    near, far = measurement.map_log_likelihood(near_and_far, sign, z, VARIANCE, np.zeros((2, 2)))
+    assert near > far  # without the factor the particle that fits worst would win
+
+
+@pytest.mark.usefixtures("no_floor", "no_resampling")
+def test_as_printed_a_sign_of_the_map_weighs_at_each_look_and_not_again_when_it_is_settled() -> None:
+    filter_, sign = particles_of(60), np.array([-20.0, 4.0])
+    filter_.as_printed = True
+    z = np.array(h(np.array([10.0, -4.0, 2.9]), sign))
+    filter_.add(z, VARIANCE, (sign, np.array([0.04, 0.0, 0.04])))
+    before = filter_.log_weight.copy()
+    expected = 3 * measurement.map_log_likelihood(filter_.state[:3], sign, z, VARIANCE, filter_.camera)
+    for _ in range(3):
+        filter_.measure(0, z, VARIANCE, weigh=True)
+    assert filter_.log_weight - before == pytest.approx(expected)
+    assert filter_.weights() == pytest.approx(np.exp(expected) / np.exp(expected).sum())
+    filter_.settle(0)
+    assert filter_.log_weight - before == pytest.approx(expected)
+
+
+@pytest.mark.usefixtures("no_resampling")
+def test_as_printed_a_wrong_sign_of_the_map_is_believed_more_than_it_knows() -> None:
+    """A map sign 1.5 m off, of sigma 1 m, looked at 60 times: Eq. 17 takes its place as exact at each look, and the
+    vehicle is certain of a pose that is off; taken in once, the map's error stays in what the vehicle claims.
+    """
+    true, sign = np.array([10.0, -4.0, 2.9]), np.array([-20.0, 4.0])
+    wrong = sign + np.array([1.5 * np.cos(2.9), 1.5 * np.sin(2.9)])  # along the way
+    z, claimed = np.array(h(true, sign)), {}
+    for as_printed in (False, True):
+        filter_ = particles_of(4000, np.diag([1.0, 1.0, 1e-6]))
+        filter_.as_printed = as_printed
+        filter_.add(z, VARIANCE, (wrong, np.array([1.0, 0.0, 1.0])))
+        for _ in range(60):
+            filter_.measure(0, z, VARIANCE, weigh=True)
+        pose, cov = filter_.pose(filter_.weights())
+        off = pose[:2] - true[:2]
+        claimed[as_printed] = float(off @ np.linalg.inv(cov[:2, :2]) @ off)
+    assert claimed[False] < 6.0 < 13.8 < claimed[True]  # chi-square of two: 95 % and 99.9 %

@@ -36,6 +36,16 @@ def test_beyond_its_bounds_nothing_is_learnt() -> None:
     assert belief.value <= 0.15 + 1e-9
 
 
+def test_as_long_as_nothing_is_known_errors_may_be_large() -> None:
+    """What is claimed of a place goes by the mean square, which doubt about a sigma makes larger; many signs end it."""
+    sensor, rng = SensorModel(0.9), np.random.default_rng(4)
+    assert sensor.claimed[0] > 4.0 * sensor.held[0]
+    for error in rng.normal(0.0, 0.05, 60):
+        sensor.settled(np.array([error, 0.0]), np.full(2, 1e-6), np.full(2, 1.0))
+    assert np.sqrt(sensor.claimed[0]) == pytest.approx(0.05, rel=0.3)
+    assert sensor.claimed[0] == pytest.approx(sensor.held[0], rel=0.1)
+
+
 def test_white_noise_is_followed_when_it_changes() -> None:
     rng, sensor, stated = np.random.default_rng(5), SensorModel(0.9), np.array([1.0, radians(2.5) ** 2])
     for factor in (1.0, 2.0):

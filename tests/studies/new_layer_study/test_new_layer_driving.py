@@ -39,3 +39,20 @@ def test_directions_along_a_straight_road_are_its_heading() -> None:
     )
     ahead = drive.truth.poses + np.array([np.cos(heading), np.sin(heading), 0.0])
     np.testing.assert_allclose(along_and_across(ahead, drive.truth.poses)[0], [1.0, 0.0], atol=1e-9)
+
+
+def test_drives_have_hard_noise_unless_kind_is_asked_for(tmp_path: Path) -> None:
+    hard, kind = (drive_of(RouteTask(TRACK, 14, 0.15, noise=noise), 1) for noise in ("hard", "kind"))
+    np.testing.assert_array_equal(hard.truth.poses, kind.truth.poses)
+    shares = []
+    for drive in (hard, kind):
+        beacon = np.bincount(np.concatenate(drive.truth.of_detection)[np.concatenate(drive.truth.of_detection) > 0])
+        most, off = int(beacon.argmax()), []
+        place = drive.route.features.xy_m[np.flatnonzero(drive.route.features.feature_id == most)[0]]
+        for look, of, pose in zip(drive.looks, drive.truth.of_detection, drive.truth.look_poses, strict=True):
+            off += (look.range_m[of == most] - np.hypot(*(place - pose[:2]))).tolist()
+        shares.append(abs(np.mean(off)) / (1.0 / np.sqrt(len(off))))
+    assert shares[0] > 6.0 > 4.0 > shares[1], "in sigmas of a mean: hard errors stay with a beacon, white ones do not"
+    plans = [tasks_of(NewLayerOptions(seeds=(14,), noise=noise), 14, tmp_path) for noise in ("hard", "kind")]
+    folders = [{task.layers.path.parent for drives in plan.routes.values() for task in drives} for plan in plans]
+    assert folders[0].isdisjoint(folders[1]), "both may lie in one folder"

@@ -15,6 +15,7 @@ from studies.slamcu_study.scores import (
     accuracy_of,
     distribution_of,
     drive_summary,
+    known_plain,
     lost_without_knowing,
     merged_score,
     score,
@@ -29,6 +30,7 @@ from studies.slamcu_study.signs import (
     NORMAL,
     PAPER_ACCURACY,
     PAPER_CONFUSION,
+    MeasuredSigns,
     MergedSigns,
     SignTruth,
     Verdicts,
@@ -117,12 +119,23 @@ def test_the_papers_table_gives_the_papers_accuracies() -> None:
 
 
 def test_a_merged_layer_says_deleted_by_holding_a_sign_no_more() -> None:
+    known = MeasuredSigns(np.array([1, 2, 4]), np.zeros((3, 2)), np.broadcast_to(np.eye(2), (3, 2, 2)))
     merged = MergedSigns(
-        np.array([1, 2, 4]), np.array([[40.0, 0.0], [91.0, 0.0]]), np.broadcast_to(np.eye(2), (2, 2, 2))
+        known.feature_id, np.array([[40.0, 0.0], [91.0, 0.0]]), np.broadcast_to(np.eye(2), (2, 2, 2)), known
     )
     scored = merged_score(merged, TRUTH)
     assert scored.confusion.tolist() == [[2, 0, 0, 0], [1, 1, 0, 0], [0, 0, 2, 1]]
     assert scored.distance_m == pytest.approx([0.0, 1.0])
+
+
+def test_measured_signs_are_judged_where_they_stand_as_mapped() -> None:
+    """The sign 3 is gone: where a drive has measured it says nothing. Claims that are too small show in the NEES."""
+    places, cov = np.array([[0.0, 0.3], [10.4, 0.0], [20.0, 9.0]]), np.broadcast_to(0.01 * np.eye(2), (3, 2, 2))
+    found = known_plain([MeasuredSigns(np.array([1, 2, 3]), places, cov)], TRUTH)
+    assert found["found"] == 2
+    assert found["mean"] == pytest.approx(0.35)
+    assert found["nees"]["mean"] == pytest.approx((9.0 + 16.0) / 2)
+    assert known_plain([], TRUTH)["nees"] is None
 
 
 def test_a_wider_radius_finds_what_a_narrow_one_misses() -> None:

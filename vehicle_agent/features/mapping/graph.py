@@ -1,14 +1,16 @@
 """GraphSLAM of a drive in the plane with GTSAM (Kim et al. 2018, sections 3.1 and 3.2).
 
-Nodes are the poses of keyframes, the features, the slow errors of the GNSS, and two numbers of the drive: wheel scale
-and gyro bias. Edges are motion (Eq. 1-2), measurements of features (Eq. 3-5), fixes, and matches with the HD map
-(Eq. 7-9). The cost is Eq. (6), or Eq. (10) when there are matches.
+Nodes are the poses of keyframes, the features, the slow errors of the GNSS, two numbers of the drive, wheel scale and
+gyro bias, and of each feature the errors of range and bearing that stay with it. These show in passing: what is
+measured too far lies ahead of its place while it comes nearer, and behind it afterwards. Edges are motion (Eq. 1-2),
+measurements of features (Eq. 3-5), fixes, and matches with the HD map (Eq. 7-9). The cost is Eq. (6), or Eq. (10) when
+there are matches.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from math import cos, pi, sin
+from math import atan2, cos, hypot, pi, sin
 from typing import Any
 
 import gtsam
@@ -52,6 +54,11 @@ class Solution:
         R[:, 2, 2] = 1.0
         return np.asarray(R @ found @ R.transpose(0, 2, 1))
 
+    def error_variance(self) -> F64:
+        """(N, 2) marginal variances of the errors of range (share) and bearing [rad] that stay with the features."""
+        found = self._marginals([_e(n) for n in range(len(self.state.errors))], 2)
+        return np.asarray(np.diagonal(found, axis1=1, axis2=2))
+
     def _marginals(self, keys: list[int], size: int) -> F64:
         with _determined(len(self.state.pose)):
             marginals = gtsam.Marginals(self._graph, self._values)
@@ -78,13 +85,18 @@ def solve(problem: Problem, start: State, sensors: DriveSensors) -> Solution:
     _add_poses(values, start)
     _add_calibration(graph, sensors)
     _add_fixes(graph, values, problem.fixes, start, sensors)
-    _add_ties(graph, problem.ties)
     _add_anchors(graph, problem.anchors)
     own = _motion(problem) + _matches(problem.lanes)
+    errs = bool((problem.held > 0.0).all()) and len(start.xy_m) > 0
+    if errs:
+        _add_errors(graph, values, start, problem.held)
+        own += _erring_ties(problem.ties)
+    else:
+        _add_ties(graph, problem.ties)
     with _determined(len(start.pose)):
         linear, optimum = _optimised(graph, own, values)
     cost = 2.0 * (graph.error(optimum) + sum(factor.error(optimum) for factor in own))  # Eq. (6), (10)
-    return Solution(_state(optimum, len(start.pose), len(start.xy_m)), cost, linear, optimum)
+    return Solution(_state(optimum, len(start.pose), len(start.xy_m), errs=errs), cost, linear, optimum)
 
 
 def pose2(pose: F64) -> Any:
@@ -98,6 +110,10 @@ def _x(n: int) -> int:
 
 def _l(n: int) -> int:
     return int(gtsam.symbol("l", n))
+
+
+def _e(n: int) -> int:
+    return int(gtsam.symbol("e", n))
 
 
 def _b(n: int) -> int:
@@ -126,12 +142,13 @@ def _optimised(graph: Any, own: list[Any], values: Any) -> tuple[Any, Any]:
     return linear, values
 
 
-def _state(values: Any, n_poses: int, n_landmarks: int) -> State:
+def _state(values: Any, n_poses: int, n_landmarks: int, *, errs: bool) -> State:
     poses = [values.atPose2(_x(k)) for k in range(n_poses)]
     return State(
         np.array([(p.x(), p.y(), p.theta()) for p in poses]),
         np.array([values.atPoint2(_l(n)) for n in range(n_landmarks)]).reshape(-1, 2),
         np.array(values.atPoint2(CALIBRATION)),
+        np.array([values.atPoint2(_e(n)) for n in range(n_landmarks if errs else 0)]).reshape(-1, 2),
     )
 
 
@@ -216,6 +233,50 @@ def _add_ties(graph: Any, ties: Ties) -> None:
         noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov))
         seen = gtsam.Rot2.fromAngle(bearing)
         graph.add(gtsam.BearingRangeFactor2D(_x(int(key)), _l(int(landmark)), seen, distance, noise))
+
+
+def _add_errors(graph: Any, values: Any, start: State, held: F64) -> None:
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(held))
+    errors = start.errors if len(start.errors) else np.zeros((len(start.xy_m), 2))
+    for n, error in enumerate(errors):
+        values.insert(_e(n), error)
+        graph.add(gtsam.PriorFactorPoint2(_e(n), np.zeros(2), noise))
+
+
+def _erring_ties(ties: Ties) -> list[Any]:
+    """Eq. (4)-(5) of features with errors of their own."""
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
+    factors = []
+    for key, landmark, (bearing, distance), cov in zip(*ties, strict=True):
+        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov))
+        keys = [_x(int(key)), _l(int(landmark)), _e(int(landmark))]
+        factors.append(gtsam.CustomFactor(noise, keys, _ErringTie(float(bearing), float(distance))))
+    return factors
+
+
+class _ErringTie:
+    """Eq. (5) as GTSAM asks for it: bearing and range predicted minus measured, with the feature's own errors."""
+
+    __slots__ = ("bearing", "distance")
+
+    def __init__(self, bearing: float, distance: float) -> None:
+        self.bearing, self.distance = bearing, distance
+
+    def __call__(self, factor: Any, values: Any, jacobians: list[F64] | None) -> F64:
+        key, landmark, error = factor.keys()
+        pose, place, (share, turn) = values.atPose2(key), values.atPoint2(landmark), values.atPoint2(error)
+        dx, dy, theta = place[0] - pose.x(), place[1] - pose.y(), pose.theta()
+        c, s = cos(theta), sin(theta)
+        ux, uy = c * dx + s * dy, c * dy - s * dx  # in the vehicle's frame
+        r = max(hypot(ux, uy), 1e-3)
+        if jacobians is not None:
+            scale = (1.0 + share) / r
+            bx, by, rx, ry = -uy / r**2, ux / r**2, scale * ux, scale * uy
+            jacobians[0] = np.array([[-bx, -by, -1.0], [-rx, -ry, 0.0]])
+            jacobians[1] = np.array([[bx * c - by * s, bx * s + by * c], [rx * c - ry * s, rx * s + ry * c]])
+            jacobians[2] = np.array([[0.0, 1.0], [r, 0.0]])
+        off = (atan2(uy, ux) + turn - self.bearing + pi) % (2.0 * pi) - pi
+        return np.array([off, r * (1.0 + share) - self.distance])
 
 
 def _matches(matches: PoseMatches) -> list[Any]:

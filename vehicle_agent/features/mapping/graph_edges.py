@@ -1,6 +1,6 @@
 """What the graph of a drive is made of: its edges as columns (Kim et al. 2018, Eq. 1-9), and its nodes' values."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +67,11 @@ NO_ANCHORS = GraphAnchors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """All edges of a drive. calibration: (2,) wheel scale and gyro bias that `steps` were made with."""
+    """All edges of a drive.
+
+    calibration: (2,) wheel scale and gyro bias that `steps` were made with. held: (2,) variances of the errors of range
+    (share) and bearing [rad] that stay with a feature, of which its sensor states nothing; 0: there are none.
+    """
 
     steps: Steps
     calibration: F64
@@ -75,6 +79,7 @@ class Problem:
     ties: Ties = NO_TIES
     lanes: PoseMatches = NO_MATCHES
     anchors: GraphAnchors = NO_ANCHORS
+    held: F64 = field(default_factory=lambda: np.zeros(2))
 
 
 class State(NamedTuple):
@@ -86,3 +91,5 @@ class State(NamedTuple):
     """(N, 2) features."""
     calibration: F64
     """(2,) wheel scale and gyro bias [rad/s]."""
+    errors: F64 = np.empty((0, 2))
+    """(N, 2) errors of range (share) and bearing [rad] that stay with a feature; empty where none are expected."""

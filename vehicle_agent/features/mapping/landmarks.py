@@ -73,6 +73,19 @@ class LandmarkPlaces(NamedTuple):
     """(N,)"""
 
 
+class KnownPlaces(NamedTuple):
+    """N features that measurements may be of."""
+
+    xy_m: F64
+    """(N, 2)"""
+    kind: I64
+    """(N,)"""
+    slack_m: F64
+    """(N,) sigma of where a feature is as seen from the poses around, beside the sensor's noise."""
+    errors: F64
+    """(N, 2) errors of range (share) and bearing [rad] that stay with it."""
+
+
 def places(m: Measurements, sight: Sight, pose: F64) -> tuple[F64, F64]:
     """(M, 2) where measurements lie in the map frame, and (M, 2, 2) how certain by the sensor's noise alone."""
     at = composed(pose[sight.key], sight.offset)
@@ -85,13 +98,26 @@ def places(m: Measurements, sight: Sight, pose: F64) -> tuple[F64, F64]:
     return xy, np.asarray(np.einsum("mij,mj,mkj->mik", R, variance, R))
 
 
-def clustered(m: Measurements, sight: Sight, pose: F64) -> tuple[I64, F64]:
-    """The first association: (M,) feature of each measurement, and (N, 2) features; all hits count, ghosts too."""
-    xy, cov = places(m, sight, pose)
+def _lasting(m: Measurements, sight: Sight, pose: F64, held: F64) -> F64:
+    """(M, 2, 2) how far from each other two measurements of a feature may lie by errors that stay with it, variances
+    (2,) of range (share) and bearing [rad]: one was made from another side or range.
+    """
+    direction = composed(pose[sight.key], sight.offset)[:, 2] + m.bearing_rad
+    c, s = np.cos(direction), np.sin(direction)
+    R = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    return np.asarray(np.einsum("mij,mj,mkj->mik", R, m.range_m[:, None] ** 2 * held, R))
+
+
+def clustered(m: Measurements, sight: Sight, pose: F64, held: F64) -> tuple[I64, F64]:
+    """The first association: (M,) feature of each measurement, and (N, 2) features; all hits count, ghosts too. `held`:
+    variances (2,) of the errors of range (share) and bearing [rad] that stay with a feature.
+    """
+    (xy, cov), lasting = places(m, sight, pose), _lasting(m, sight, pose, held)
     c = _Clusters(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
     owner = np.full(len(m), NONE, np.int64)
     for rows in _looks(m.look):
-        owner[rows] = _take(c, xy[rows], cov[rows], m.kind[rows], float(sight.way_m[rows[0]]))
+        at = xy[rows], cov[rows], lasting[rows]
+        owner[rows] = _take(c, at, m.kind[rows], float(sight.way_m[rows[0]]))
     return owner, c.xy_m
 
 
@@ -102,10 +128,13 @@ def _looks(look: I64) -> list[I64]:
     return np.split(np.arange(len(look)), np.flatnonzero(np.diff(look)) + 1)
 
 
-def _take(c: _Clusters, xy: F64, cov: F64, kind: I64, way_m: float) -> I64:
-    """The clusters of the measurements of one look, which join them or begin new ones."""
+def _take(c: _Clusters, at: tuple[F64, F64, F64], kind: I64, way_m: float) -> I64:
+    """The clusters of the measurements of one look, which join them or begin new ones; `at`: their places (Z, 2),
+    covariances (Z, 2, 2) by the sensor's noise, and by what stays with a feature.
+    """
+    xy, cov, lasting = at
     near = np.flatnonzero((np.abs(c.xy_m[None] - xy[:, None]).max(axis=2) < FAR_M).any(axis=0))
-    cost = _squared(xy, cov, c, near, way_m)
+    cost = _squared(xy, cov + lasting, c, near, way_m)
     cost[kind[:, None] != c.kind[near]] = FORBIDDEN
     cost[cost > _GATE_CHI2] = FORBIDDEN
     pairs = associate(cost, _GATE_CHI2)
@@ -141,37 +170,36 @@ def _begin(c: _Clusters, xy: F64, cov: F64, kind: int, way_m: float) -> int:
     return len(c.xy_m) - 1
 
 
-def assigned(m: Measurements, sight: Sight, pose: F64, xy_m: F64, kind: I64, slack_m: F64) -> I64:
+def assigned(m: Measurements, sight: Sight, pose: F64, at: KnownPlaces) -> I64:
     """Measurements given to known features anew, from better poses: (M,) feature, `NONE` = of none.
 
     Args:
         m: M measurements.
         sight: where from.
         pose: (K, 3) of the keyframes.
-        xy_m: (N, 2) features.
-        kind: (N,) theirs.
-        slack_m: (N,) sigma of where a feature is as seen from the poses around, beside the sensor's noise.
+        at: N features.
     """
     owner = np.full(len(m), NONE, np.int64)
-    at = composed(pose[sight.key], sight.offset)
+    stood = composed(pose[sight.key], sight.offset)
     seen, _ = places(m, sight, pose)
     for rows in _looks(m.look):
-        near = np.flatnonzero((np.abs(xy_m[None] - seen[rows][:, None]).max(axis=2) < FAR_M).any(axis=0))
-        cost = _polar_squared(m, rows, at[rows[0]], xy_m[near], slack_m[near])
-        cost[m.kind[rows][:, None] != kind[near]] = FORBIDDEN
+        near = np.flatnonzero((np.abs(at.xy_m[None] - seen[rows][:, None]).max(axis=2) < FAR_M).any(axis=0))
+        cost = _polar_squared(m, rows, stood[rows[0]], at, near)
+        cost[m.kind[rows][:, None] != at.kind[near]] = FORBIDDEN
         cost[cost > _GATE_CHI2] = FORBIDDEN
         pairs = associate(cost, _GATE_CHI2)
         owner[rows[pairs.measurement]] = near[pairs.feature]
     return owner
 
 
-def _polar_squared(m: Measurements, rows: I64, at: F64, xy_m: F64, slack_m: F64) -> F64:
+def _polar_squared(m: Measurements, rows: I64, stood: F64, at: KnownPlaces, near: I64) -> F64:
     """(Z, N) squared distances in sigmas of bearing and range."""
-    off = rotated(np.full(len(xy_m), -at[2]), xy_m - at[:2])
-    distance, bearing = np.maximum(np.hypot(*off.T), 0.1), np.arctan2(off[:, 1], off[:, 0])
+    slack_m, errors = at.slack_m[near], at.errors[near]
+    off = rotated(np.full(len(near), -stood[2]), at.xy_m[near] - stood[:2])
+    distance, bearing = np.maximum(np.hypot(*off.T), 0.1), np.arctan2(off[:, 1], off[:, 0]) + errors[:, 1]
     sigma_range = m.sigma_range_m[rows][:, None] ** 2 + slack_m**2
     sigma_bearing = m.sigma_bearing_rad[rows][:, None] ** 2 + (slack_m / distance) ** 2
-    by_range = (m.range_m[rows][:, None] - distance) ** 2 / sigma_range
+    by_range = (m.range_m[rows][:, None] - distance * (1.0 + errors[:, 0])) ** 2 / sigma_range
     return np.asarray(by_range + wrapped(m.bearing_rad[rows][:, None] - bearing) ** 2 / sigma_bearing)
 
 

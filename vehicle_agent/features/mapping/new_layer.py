@@ -21,6 +21,7 @@ from gnd.vehicle_agent.features.mapping.landmarks import (
     LANDMARK_MIN_HITS,
     LANDMARK_REVISIT_M,
     NONE,
+    KnownPlaces,
     LandmarkPlaces,
     Sight,
     assigned,
@@ -34,8 +35,10 @@ from gnd.vehicle_agent.features.mapping.lanes import LaneMap, LaneMatcher
 from gnd.vehicle_agent.features.mapping.sensors import SERIES_CAR, DriveSensors
 from gnd.vehicle_agent.features.mapping.smoothed_path import SmoothedPath
 from gnd.vehicle_agent.features.mapping.strain import Strain, strains
+from gnd.vehicle_agent.features.slamcu.sensor_model import SensorModel
 
 ROUNDS: Final = 6
+CONFIDENT: Final = 0.9
 _SETTLED_M: Final = 0.01
 """Rounds end when no feature moves by more."""
 
@@ -123,6 +126,8 @@ class _Mapping:
         self.owner = np.full(len(self.m), NONE, np.int64)
         self.xy_m = known.xy_m
         self.kind = self._known_kinds()
+        self.errors = np.zeros((len(known.xy_m), 2))  # of range (share) and bearing [rad], each feature's own
+        self.detector = SensorModel(CONFIDENT)
         self.strains: tuple[Strain, ...] = ()
 
     def _known_kinds(self) -> I64:
@@ -170,7 +175,7 @@ class _Mapping:
         sight, pose = self.sight, self.state.pose
         slack = np.full(len(self.xy_m), LANDMARK_DRIFT_M)
         slack[: len(self.known.xy_m)] = slack_m if self.trust_known else LANDMARK_REVISIT_M
-        self.owner = assigned(self.m, sight, pose, self.xy_m, self.kind, slack)
+        self.owner = assigned(self.m, sight, pose, KnownPlaces(self.xy_m, self.kind, slack, self.errors))
         if self.find_new:
             self._find_new(sight, pose)
         self._drop_ghosts()
@@ -179,13 +184,14 @@ class _Mapping:
         left = np.flatnonzero(self.owner == NONE)
         rest = replace(self.m, **{c: getattr(self.m, c)[left] for c in _COLUMNS})
         where = Sight(sight.key[left], sight.offset[left], sight.way_m[left])
-        found, xy_m = clustered(rest, where, pose)
+        found, xy_m = clustered(rest, where, pose, self.detector.claimed)
         new = kept(found, LANDMARK_MIN_HITS)
         _, first = np.unique(found[new >= 0], return_index=True)
         rows = left[new >= 0]
         self.owner[rows] = len(self.xy_m) + new[new >= 0]
         self.xy_m = np.concatenate([self.xy_m, xy_m[np.unique(found[new >= 0])]])
         self.kind = np.append(self.kind, self.m.kind[rows[first]])
+        self.errors = np.concatenate([self.errors, np.zeros((len(self.xy_m) - len(self.errors), 2))])
 
     def _drop_ghosts(self) -> None:
         """New features with too few measurements go; known ones stay, seen or not."""
@@ -194,7 +200,7 @@ class _Mapping:
         stays = (hits >= LANDMARK_MIN_HITS) | (np.arange(n) < n_known)
         number = np.append(np.where(stays, np.cumsum(stays) - 1, NONE), NONE)
         self.owner = np.where(self.owner >= 0, number[self.owner], NONE)
-        self.xy_m, self.kind = self.xy_m[stays], self.kind[stays]
+        self.xy_m, self.kind, self.errors = self.xy_m[stays], self.kind[stays], self.errors[stays]
 
     def _solve(self, polish: bool = False) -> Solution:
         """Optimise with the features that are tied to the drive; the others are no nodes."""
@@ -202,15 +208,25 @@ class _Mapping:
         number = np.full(len(self.xy_m) + 1, NONE)
         number[seen] = np.arange(len(seen))
         ties = tied(self.m, self.sight, number[self.owner], self.state.pose, self.xy_m[seen])
-        start = State(self.state.pose, self.xy_m[seen], self.state.calibration)
-        problem = replace(self._problem(polish), ties=ties, anchors=self._anchors(seen, number))
+        start = State(self.state.pose, self.xy_m[seen], self.state.calibration, self.errors[seen])
+        held = self.detector.claimed if polish else self.detector.held
+        problem = replace(self._problem(polish), ties=ties, anchors=self._anchors(seen, number), held=held)
         solution = solve(problem, start, self.sensors)
+        self._learn(solution, held)
         self.strains = strains(problem, solution.state, self.nodes.t_ns, self.sensors)
         self.state = State(solution.state.pose, np.empty((0, 2)), solution.state.calibration)
         self.nodes = self.nodes.calibrated(solution.state.calibration)
-        self.xy_m = self.xy_m.copy()
+        self.xy_m, self.errors = self.xy_m.copy(), self.errors.copy()
         self.xy_m[seen] = solution.state.xy_m
+        if len(solution.state.errors):
+            self.errors[seen] = solution.state.errors
         return solution
+
+    def _learn(self, solution: Solution, held: F64) -> None:
+        """How large the errors are that stay with features, by those of all features that were measured."""
+        self.detector = SensorModel(CONFIDENT)
+        for error, variance in zip(solution.state.errors, solution.error_variance(), strict=True):
+            self.detector.settled(error, variance, held)
 
     def _anchors(self, seen: I64, number: I64) -> GraphAnchors:
         rows = seen[seen < len(self.known.xy_m)] if self.trust_known else np.empty(0, np.int64)

@@ -116,7 +116,9 @@ def _ties(problem: Problem, state: State, inside: np.ndarray, span: tuple[float,
         return None
     places = np.column_stack([state.xy_m[ties.landmark[rows]], np.zeros(len(rows))])
     seen = relative(state.pose[ties.key[rows]], places)[:, :2]
-    off = ties.polar[rows] - np.column_stack([np.arctan2(seen[:, 1], seen[:, 0]), np.hypot(*seen.T)])
+    errors = state.errors[ties.landmark[rows]] if len(state.errors) else np.zeros((len(rows), 2))
+    bearing, range_m = np.arctan2(seen[:, 1], seen[:, 0]) + errors[:, 1], np.hypot(*seen.T) * (1.0 + errors[:, 0])
+    off = ties.polar[rows] - np.column_stack([bearing, range_m])
     off[:, 0] = wrapped(off[:, 0])
     squared = np.einsum("ti,ti->t", off, np.linalg.solve(ties.cov[rows], off[..., None])[..., 0])
     beyond = int((squared > chi2.isf(1e-3, 2)).sum())

@@ -140,7 +140,7 @@ class MapComparison:
             if moved:
                 self._particles.priors[feature.slot] = None
             else:
-                self._particles.settle(feature.slot)
+                self._tracks.settle(feature)
             feature.cov = None
             return
         self.innovations.append(innovation_of(feature, xy_m, cov * self._tracks.sensor.places))
@@ -155,7 +155,7 @@ class MapComparison:
             if self._tracks.sensor.learns:
                 self._tracks.sensor.compared(innovation_of(feature, xy_m, cov).squared)
             feature.measured = (xy_m, cov) if before is None else fused_moments(before, (xy_m, cov))
-        self._particles.settle(feature.slot)
+        self._tracks.settle(feature)
         self._learn(feature)
 
     def _learn(self, feature: TrackedFeature) -> None:

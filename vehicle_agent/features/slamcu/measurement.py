@@ -136,6 +136,25 @@ def update(pose: F64, mean: F64, cov: F64, z: F64, variance: F64, camera: F64) -
     return out_mean, cov - np.stack(less, axis=1), one.log_likelihood
 
 
+def map_log_likelihood(pose: F64, xy_m: F64, z: F64, variance: F64, camera: F64) -> F64:
+    """(M,) log ω_HD of Eq. (17): how likely each particle finds a measurement of a map feature whose place is exact.
+
+    ω_HD = |2πR|^(-1/2) exp{-1/2 (z - ẑ)ᵀ R⁻¹ (z - ẑ)} with ẑ = h(x, m_HD). The paper prints the exponent without the
+    factor -1/2; so read, the particle that fits worst would weigh most.
+
+    Args:
+        pose: (3, M).
+        xy_m: (2,) the feature's place in the map.
+        z: (2,) range [m] and bearing [rad].
+        variance: (2,) of z, the diagonal of R.
+        camera: (2, M), errors of the camera: share of the range, and bearing [rad].
+    """
+    at = predicted(pose, xy_m)
+    nu_r, nu_b = z[0] - at.range_m * (1.0 + camera[0]), wrapped(z[1] - at.bearing_rad - camera[1])
+    squared = nu_r**2 / variance[0] + nu_b**2 / variance[1]
+    return np.asarray(-0.5 * squared - 0.5 * np.log((2.0 * np.pi) ** 2 * variance[0] * variance[1]))
+
+
 def agreement(mu: F64, sigma: F64, xy_m: F64, cov: F64) -> F64:
     """(M,) log N(μ - m; 0, Σ + C): how well each particle's feature agrees with a position known otherwise.
 
@@ -170,5 +189,34 @@ def fused(mean: F64, cov: F64, xy_m: F64, other: F64) -> tuple[F64, F64]:
     gains = [(x * a + y * b, x * b + y * c) for x, y in columns]
     d = xy_m - mean[:, :2]
     out_mean = mean + np.stack([gx * d[:, 0] + gy * d[:, 1] for gx, gy in gains], axis=1)
+    less = [gains[i][0] * columns[j][0] + gains[i][1] * columns[j][1] for i, j in PACKED]
+    return out_mean, cov - np.stack(less, axis=1)
+
+
+def with_prior(mean: F64, cov: F64, before: F64, after: F64) -> tuple[F64, F64]:
+    """A feature as it would be, had the errors that stay with it been expected to be of another size from the start.
+
+    The prior N(0, before) of these errors is divided out and N(0, after) multiplied in: information M = after⁻¹ -
+    before⁻¹ is added, Σ' = Σ - Σ E (M⁻¹ + Eᵀ Σ E)⁻¹ Eᵀ Σ with E the columns of the errors. Exact for the linearised
+    feature: its looks need not be taken again.
+
+    Args:
+        mean: (M, 4).
+        cov: (M, 10), see `PACKED`.
+        before: (2,) variances of the errors of range (share) and bearing [rad] that it was begun with, above 0.
+        after: (2,) those that hold, above 0.
+
+    Returns:
+        (M, 4) means and (M, 10) covariances.
+    """
+    m = 1.0 / after - 1.0 / before
+    ee, eb, bb = cov[:, 7], cov[:, 8], cov[:, 9]
+    # (M⁻¹ + S)⁻¹ = M (1 + S M)⁻¹, which M = 0 does not hurt
+    a, b, c, d = 1.0 + ee * m[0], eb * m[1], eb * m[0], 1.0 + bb * m[1]
+    det = a * d - b * c
+    k00, k01, k11 = m[0] * d / det, -m[0] * b / det, m[1] * a / det
+    columns = [(cov[:, 3], cov[:, 5]), (cov[:, 4], cov[:, 6]), (ee, eb), (eb, bb)]
+    gains = [(x * k00 + y * k01, x * k01 + y * k11) for x, y in columns]
+    out_mean = mean - np.stack([gx * mean[:, 2] + gy * mean[:, 3] for gx, gy in gains], axis=1)
     less = [gains[i][0] * columns[j][0] + gains[i][1] * columns[j][1] for i, j in PACKED]
     return out_mean, cov - np.stack(less, axis=1)

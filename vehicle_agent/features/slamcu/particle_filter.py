@@ -59,6 +59,8 @@ class ParticleFilter:
         provisional: F, whether such a prior weighs the particles already; not where it may be another feature's.
         rng: where chance comes from.
         weighing: whether measurements weigh particles; not where poses are given.
+        as_printed: whether a feature of the map weighs particles by Eq. (17) at each look, its place taken as exact, as
+            the paper has it; for studies.
     """
 
     def __init__(self, particles: int, pose0: F64, cov0: F64, rng: np.random.Generator) -> None:
@@ -76,7 +78,7 @@ class ParticleFilter:
         self.cov = np.zeros((0, m, 10))
         self.priors: list[Prior | None] = []
         self.provisional: list[bool] = []
-        self.weighing = True
+        self.weighing, self.as_printed = True, False
 
     @property
     def m(self) -> int:
@@ -180,6 +182,11 @@ class ParticleFilter:
 
     def measure(self, slot: int, z: F64, variance: F64, *, weigh: bool) -> None:
         """Update a feature with a measurement, Eq. (16), and the weights, Eq. (18) and (19)."""
+        prior = self.priors[slot]
+        if weigh and self.as_printed and prior is not None:
+            place = prior[0]
+            self._weigh(lambda: self._floored(self._of_map(place, z, variance)))  # Eq. (17) in place of (18)
+            weigh = False
         updated = self._updated(slot, z, variance)
         if weigh and self._weigh(lambda: self._floored(self._updated(slot, z, variance)[2]), self._floored(updated[2])):
             updated = self._updated(slot, z, variance)  # by other particles
@@ -197,7 +204,7 @@ class ParticleFilter:
     def weights(self, without: Collection[int] = ()) -> F64:
         """(M,) weights that sum to 1, with positions known otherwise (but not those of the slots `without`)."""
         log = self.log_weight.copy()
-        if self.weighing:
+        if self.weighing and not self.as_printed:
             for slot, prior in enumerate(self.priors):
                 if prior is not None and self.provisional[slot] and slot not in without:
                     log += self._agreement(slot, prior)
@@ -208,7 +215,8 @@ class ParticleFilter:
         prior = self.priors[slot]
         if prior is None:
             return
-        self._weigh(lambda: measurement.agreement(self.mu[slot], self.sigma[slot], *prior))
+        if not self.as_printed:  # else each look has weighed
+            self._weigh(lambda: measurement.agreement(self.mu[slot], self.sigma[slot], *prior))
         self.mean[slot], self.cov[slot] = measurement.fused(self.mean[slot], self.cov[slot], *prior)
         self.priors[slot] = None
 
@@ -233,13 +241,24 @@ class ParticleFilter:
         if self.m > 1 and effective(weights) < _RESAMPLE_BELOW * self.m:
             self._resample(weights)
 
-    def moments(self, slot: int, weights: F64) -> tuple[F64, F64]:
-        """Position (2,) and covariance (2, 2) of a feature over all particles: that of a mixture of Gaussians."""
-        mu = self.mu[slot]
-        mean = weights @ mu
-        off = mu - mean
+    def expect(self, slot: int, before: F64, after: F64) -> None:
+        """The errors that stay with a feature are of another size, variances (2,), than it was begun with."""
+        self.mean[slot], self.cov[slot] = measurement.with_prior(self.mean[slot], self.cov[slot], before, after)
+
+    def moments(self, slot: int, weights: F64, held: tuple[F64, F64] | None = None) -> tuple[F64, F64]:
+        """Position (2,) and covariance (2, 2) of a feature over all particles: that of a mixture of Gaussians.
+
+        Args:
+            slot: of the feature.
+            weights: (M,).
+            held: variances (2,) of what stays with it: as it was begun with, and those to go by; None: as begun.
+        """
+        of_each = self.mean[slot], self.cov[slot]
+        mean_of, cov_of = of_each if held is None else measurement.with_prior(*of_each, *held)
+        mean = weights @ mean_of[:, :2]
+        off = mean_of[:, :2] - mean
         between = (off * weights[:, None]).T @ off
-        xx, xy, yy = weights @ self.sigma[slot]
+        xx, xy, yy = weights @ cov_of[:, :3]
         return mean, between + np.array([[xx, xy], [xy, yy]])
 
     def errors_of(self, slot: int, weights: F64) -> tuple[F64, F64]:
@@ -261,6 +280,9 @@ class ParticleFilter:
 
     def _updated(self, slot: int, z: F64, variance: F64) -> tuple[F64, F64, F64]:
         return measurement.update(self.state[:3], self.mean[slot], self.cov[slot], z, variance, self.camera)
+
+    def _of_map(self, xy_m: F64, z: F64, variance: F64) -> F64:
+        return measurement.map_log_likelihood(self.state[:3], xy_m, z, variance, self.camera)
 
     def _floored(self, log_likelihood: F64) -> F64:
         return np.asarray(np.logaddexp(log_likelihood, np.log(max(_FLOOR, 1e-300))))

@@ -78,9 +78,18 @@ class ScaleBelief:
     @property
     def value(self) -> float:
         """The standard deviation: the mean of its logarithm."""
+        return float(np.exp(self._weights @ self._ln))
+
+    @property
+    def variance(self) -> float:
+        """The variance of an error whose standard deviation is this uncertain: the mean of the square."""
+        return float(self._weights @ np.exp(2.0 * self._ln))
+
+    @property
+    def _weights(self) -> F64:
         together = self._before + self._log
         weights = np.exp(together - together.max())
-        return float(np.exp(weights @ self._ln / weights.sum()))
+        return np.asarray(weights / weights.sum())
 
 
 @dataclass(slots=True)
@@ -137,6 +146,13 @@ class SensorModel:
     def held(self) -> F64:
         """(2,) variances of the errors of range (share) and of bearing [rad] that stay with a feature."""
         return np.square([one.value for one in self._held]) if self.learns else np.zeros(2)
+
+    @property
+    def claimed(self) -> F64:
+        """(2,) the same for what is claimed of places: as long as nobody knows how large these errors are, they may be
+        large.
+        """
+        return np.array([one.variance for one in self._held]) if self.learns else np.zeros(2)
 
     @property
     def white(self) -> F64:

@@ -309,6 +309,10 @@ class Slamcu:
         """
         self._tracks.hold(known)
 
+    def weigh_as_printed(self) -> None:
+        """From now on features of the map weigh particles as Eq. (17) is printed; for studies of the paper."""
+        self._particles.as_printed = True
+
     def forget(self, feature_ids: Collection[int]) -> None:
         """Features of the map that matter no longer, such as those of a tile that was left."""
         self._tracks.forget(feature_ids)
@@ -439,7 +443,7 @@ class Slamcu:
 
     def _new_feature(self, feature: TrackedFeature, weights: F64) -> NewFeature:
         if feature.slot is not None:
-            xy_m, cov = self._particles.moments(feature.slot, weights)
+            xy_m, cov = self._tracks.claimed(feature, weights)
         else:
             assert feature.cov is not None
             xy_m, cov = feature.xy_m, feature.cov[[0, 1, 1, 2]].reshape(2, 2)

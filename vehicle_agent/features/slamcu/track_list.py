@@ -128,7 +128,7 @@ class TrackList:
 
     def freeze(self, feature: TrackedFeature) -> None:
         """Keep the position of a new feature as it is, and estimate it no longer."""
-        feature.xy_m, cov = self.particles.moments(feature.estimated_in, self.particles.weights())
+        feature.xy_m, cov = self.claimed(feature, self.particles.weights())
         feature.cov = np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
         self.end(feature)
 
@@ -141,7 +141,24 @@ class TrackList:
         on those of others.
         """
         without = [one.slot or 0 for one in (feature, *others)]
-        return self.particles.moments(feature.estimated_in, self.particles.weights(without))
+        return self.claimed(feature, self.particles.weights(without))
+
+    def claimed(self, feature: TrackedFeature, weights: F64) -> tuple[F64, F64]:
+        """Position (2,) and covariance (2, 2) of an estimated feature, with what is known now of errors that stay with
+        features: those that the camera saw first were estimated before it was known.
+        """
+        held = (feature.held, self.sensor.claimed) if self.sensor.learns else None
+        return self.particles.moments(feature.estimated_in, weights, held)
+
+    def settle(self, feature: TrackedFeature) -> None:
+        """Take a feature's position known otherwise for good; what its errors may be by what is known now, or the first
+        signs of a drive would make the pose surer than they can.
+        """
+        if self.sensor.learns:
+            claimed = self.sensor.claimed
+            self.particles.expect(feature.estimated_in, feature.held, claimed)
+            feature.held = claimed
+        self.particles.settle(feature.estimated_in)
 
     # What is estimated is another feature
 

@@ -96,7 +96,13 @@ def _same(tracks: TrackList, other: TrackedFeature, feature: TrackedFeature) -> 
 
 
 def _apart(tracks: TrackList, other: TrackedFeature, feature: TrackedFeature) -> tuple[F64, F64]:
-    """Mean (2,) and covariance (2, 2) of how far apart two features are."""
+    """Mean (2,) and covariance (2, 2) of how far apart two features are. A new one beside a feature of the map is as
+    uncertain as what is claimed of it: what the camera saw first was estimated before its errors were known.
+    """
+    if other.known and other.slot is None:
+        xy_m, cov = tracks.claimed(feature, tracks.particles.weights())
+        assert other.cov is not None
+        return xy_m - other.xy_m, cov + other.cov[[0, 1, 1, 2]].reshape(2, 2)
     particles, weights, slot = tracks.particles, tracks.particles.weights(), feature.estimated_in
     mu, sigma = particles.mu[slot], particles.sigma[slot]
     if other.slot is not None:

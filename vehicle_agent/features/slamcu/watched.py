@@ -167,6 +167,11 @@ class WatchedSlamcu:
         for slamcu in self._all:
             slamcu.hold(known)
 
+    def weigh_as_printed(self) -> None:
+        """As of `Slamcu`, and for every state from which the way may be run again."""
+        for slamcu in self._all:
+            slamcu.weigh_as_printed()
+
     def forget(self, feature_ids: Collection[int]) -> None:
         """As of `Slamcu`, and for every state from which the way may be run again."""
         for slamcu in self._all:
