@@ -21,8 +21,6 @@ _MANY_RAYS: Final = 100
 """So many rays into a voxel without a Gaussian make too few hits a statement: by the one rule it is empty."""
 _EMPTY_CELLS: Final = 15
 """From here on a voxel is never called empty: another vehicle may find the sub-cells that are missing."""
-DETECT_RESHAPED_LOG_ODDS: Final = -0.4
-"""A measured Gaussian is of another shape than the map's from these log-odds on (see `shape_change`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,8 +117,14 @@ def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
         was = e.base.gaussians.take(e.map_row[rows])
         noise_m = math.sqrt(NOISE_M**2 + p.excess_m2(e.pose))  # the pose's Σ in Eq. (15)
         features = shape_features(was, e.measured.take(rows), e.n_bi[rows], e.n_bo[rows], e.n_pi[rows], noise_m)
-        result[rows] = fitted().log_odds(features) <= DETECT_RESHAPED_LOG_ODDS
+        result[rows] = ~fitted().reshaped(features)
     return result
+
+
+def shape_candidates(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
+    """Rows (C,) in which the shape alone decides between normal and modified: two Gaussians, and evidence enough."""
+    decided = np.isin(_state(e, p), (ChangeState.SUSTAINED, ChangeState.CHANGED))
+    return np.flatnonzero(e.in_map & (e.measured.cells >= MIN_CELLS) & decided)
 
 
 def tile_change(found: Classification) -> TileChange:

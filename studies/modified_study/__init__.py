@@ -1,0 +1,1 @@
+"""How well "modified" is decided, by fitted trees and by plain thresholds: `gnd reproduce modified`."""
