@@ -97,6 +97,8 @@ def lost_reports(folder: RunFolder, store: SqliteStore, layers: Sequence[str] = 
         made |= outbox.states()
         outbox.close()
     stored = {row.report_id for layer in layers for row in store.reports(layer)}
+    for layer in layers:
+        stored |= store.road_reports(layer)
     return sorted(report_id for report_id, state in made.items() if report_id not in stored and state != "quarantined")
 
 

@@ -29,6 +29,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "map": ("gnd.deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
     "view": ("gnd.deploy.map_export.view:view", "Show a map, its changes and its fleet in Rerun."),
     "features": ("gnd.deploy.features_cli:features", "Import, export and list feature layers: Lanelet2, GeoJSON, ..."),
+    "lanes": ("gnd.deploy.lanes_cli:lanes", "Lane borders of a Lanelet2 map kept by vehicles, and edits of the map."),
     "import": (
         "gnd.vehicle_agent.importer_cli:import_drives",
         "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive.",
@@ -38,6 +39,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "config": ("gnd.deploy.config_cli:config", "Show and check the settings of the programs."),
     "sim": ("gnd.fleet_sim.cli:sim", "Write and inspect simulated worlds and drives."),
     "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and compare them with ours."),
+    "benchmark": (
+        "gnd.deploy.reproduce:benchmark",
+        "Export worlds as files, and score any program that finds their changes.",
+    ),
     "router": ("gnd.fleet_bus.cli:router", "Run the Zenoh router alone."),
     "store": ("gnd.tile_store.cli:store", "Run the tile server alone."),
     "merger": ("gnd.cloud_merger.cli:merger", "Run one merger shard alone."),

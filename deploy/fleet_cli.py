@@ -69,7 +69,11 @@ RUN_OPTIONS = (
     click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs."),
     click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]"),
     click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder."),
-    click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging (merger.merge.mode)."),
+    click.option(
+        "--merge-mode",
+        type=click.Choice(["default", "paper", "paper-observers"]),
+        help="Rules of merging (merger.merge.mode).",
+    ),
     click.option(
         "--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection (agent.detect.mode)."
     ),

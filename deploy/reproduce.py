@@ -1,4 +1,4 @@
-"""`gnd reproduce`: the studies stand in the checkout, beside what is installed, and are found there."""
+"""`gnd reproduce` and `gnd benchmark`: the studies stand in the checkout, beside what is installed."""
 
 import importlib
 import sys
@@ -19,18 +19,22 @@ def checkout() -> Path:
     root = Path(gnd.__file__).resolve().parents[2]
     if not (root / "studies" / "cli.py").is_file():
         raise NoStudies(
-            f"there is no folder `studies` in {root}: the papers' results are reproduced in a checkout of the"
+            f"there is no folder `studies` in {root}: `gnd reproduce` and `gnd benchmark` work in a checkout of the"
             " sources, where `make setup` installs this command"
         )
     return root
 
 
-def _reproduce() -> click.Command:
+def _command(module: str, name: str) -> click.Command:
     root = str(checkout())
     if root not in sys.path:
         sys.path.insert(0, root)
-    command: click.Command = importlib.import_module("studies.cli").reproduce
+    command: click.Command = getattr(importlib.import_module(module), name)
     return command
 
 
-reproduce = _reproduce()
+def __getattr__(name: str) -> click.Command:
+    modules = {"reproduce": "studies.cli", "benchmark": "studies.benchmark.cli"}
+    if name not in modules:
+        raise AttributeError(name)
+    return _command(modules[name], name)

@@ -157,6 +157,8 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             f"parked: {waiting['parked']} new voxels have the shape of a standing vehicle: they are published when they"
             " have stood for long (`confirmation.parked_h`)"
         )
+    if waiting["season"]:
+        lines.append(f"season: {waiting['season']} changed voxels are leaves of trees that stayed: they change no map")
     lines += [one["says"] for one in summary["named_vehicles"]]
     if p95["longitudinal_m"] is not None:
         lines.append(

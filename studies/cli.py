@@ -11,6 +11,10 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "studies.simulation.study:simulation",
         "The GND paper's simulation: worlds, single drives, fleets.",
     ),
+    "paper-mode": (
+        "studies.paper_mode.study:paper_mode",
+        "The GND paper's own rules, with both readings of ξ, beside its Figures 15 to 17 and 23.",
+    ),
     "localisation": (
         "studies.localisation_study.study:localisation",
         "Localisation in a changed world, before and after the map update.",
@@ -28,14 +32,27 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "studies.new_layer_study.study:new_feature_layer",
         "A layer of beacons or lights mapped by many cars, and localisation with it.",
     ),
+    "lanes": (
+        "studies.lanes_study.study:lanes",
+        "Borders of lanes mapped by vehicles, told as edits of a Lanelet2 map.",
+    ),
     "hard-cases": (
         "studies.hard_cases.study:hard_cases",
         "Cases that make localisation fail: does the vehicle say when it is wrong?",
+    ),
+    "modified": (
+        "studies.modified_study.study:modified",
+        "Which voxels are modified: trees and thresholds, in places and by sensors that nothing was fitted on.",
     ),
     "errors": ("studies.simulation.losses:errors", "Which voxels of a simulation cost F1, and why."),
     "real-localisation": (
         "studies.real_localisation.study:real_localisation",
         "Odometry, localisation and georeferencing on real recordings.",
+    ),
+    "new-road": ("studies.new_road.study:new_road", "Roads that the map does not have, mapped by vehicles."),
+    "codec": (
+        "studies.codec_study.study:codec",
+        "What tiles weigh and what rounding does to poses, real and simulated.",
     ),
     "real": ("studies.real.study:real", "Detection on recordings of real sensors, with objects inserted."),
 }

@@ -310,7 +310,8 @@ def run_round(
     return Round(scene, untouched, _inserted(scene, mapping, driving, placed, untouched, method, number))
 
 
-def _map_of(scene: RecordedScene, scans: Iterable[Scan], method: Method) -> VoxelAccumulator:
+def map_of(scene: RecordedScene, scans: Iterable[Scan], method: Method) -> VoxelAccumulator:
+    """The points of scans as they make a map: in range, those on movers left out."""
     accumulator = VoxelAccumulator(scene.grid_frame)
     parameters = method.segment if method.segment_map else SegmentParameters(enabled=False)
     for one in segmented(map(scene.refined, scans), parameters):
@@ -319,7 +320,7 @@ def _map_of(scene: RecordedScene, scans: Iterable[Scan], method: Method) -> Voxe
 
 
 def _untouched(scene: RecordedScene, mapping: list[Scan], driving: list[Scan], method: Method) -> Untouched:
-    points = _map_of(scene, mapping, method)
+    points = map_of(scene, mapping, method)
     tiles = points.finish()
     local_map = local_map_of(scene, tiles)
     notes = _Notes(scene)
@@ -379,7 +380,7 @@ def _inserted(
     into_map = Painter(scene, [one.shape for one in gone], 2 * number)
     into_drive = Painter(scene, [one.shape for one in new], 2 * number + 1)
     crossed = Painter(scene, [one.shape for one in gone], 2 * number)
-    points = _map_of(scene, into_map.paint(mapping), method)
+    points = map_of(scene, into_map.paint(mapping), method)
     tiles = points.finish()
     local_map = local_map_of(scene, tiles)
     scans = refined_scans(scene, local_map, into_drive.paint(driving), method.poses)

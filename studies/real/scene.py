@@ -93,16 +93,17 @@ class RecordedScans:
     left_out: tuple[str, ...]
 
 
-def load(recording: Recording, at_most: int, progress: Progress) -> RecordedScans:
+def load(recording: Recording, at_most: int, progress: Progress, *, fewest: int = 4) -> RecordedScans:
     """Read a recording and find its track.
 
     Args:
         recording: of any format.
         at_most: its first scans only: all of them are held in memory.
         progress: as the importer's.
+        fewest: so many usable scans at least.
 
     Raises:
-        RealDataError: fewer than four usable scans.
+        RealDataError: fewer usable scans.
         ImportDriveError: damaged files, scans that do not fit together.
     """
     whole, n = len(recording), min(len(recording), at_most)
@@ -115,8 +116,9 @@ def load(recording: Recording, at_most: int, progress: Progress) -> RecordedScan
         if scan is not None and track.t_ns[0] <= reference_ns(scan) <= track.t_ns[-1]:
             found.append(scan)
         progress("reading scans", i + 1, n)
-    if len(found) < 4:
-        raise RealDataError(f"{recording.name}: {len(found)} usable scans of {n}; at least 4 are needed for two halves")
+    if len(found) < fewest:
+        what = " for two halves" if fewest > 2 else ""
+        raise RealDataError(f"{recording.name}: {len(found)} usable scans of {n}; at least {fewest} are needed{what}")
     left_out = list(recording.notes)
     left_out += [f"{empty} scans without a usable point: left out"] if empty else []
     left_out += [f"scans after the first {n} of {whole}: left out"] if n < whole else []

@@ -13,14 +13,16 @@ from gnd.cloud_merger.expanding import base_versions, expand, is_askable, with_m
 from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.merge import MergeParameters, merge_tile
 from gnd.cloud_merger.parked import hold_parked
+from gnd.cloud_merger.season import hold_season
 from gnd.cloud_merger.statements import Report, statements_of
 from gnd.cloud_merger.votes import TileVotes
 from gnd.cloud_merger.wants import Known, WantParameters, wanted
 from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.codec import encode_mask
+from gnd.gnd_map.foliage import follows_season
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
-from gnd.gnd_map.tile import Tile, TileDelta, apply
+from gnd.gnd_map.tile import Tile, TileDelta, apply, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.gnd_map.vehicle_shape import has_vehicle_shape
 from gnd.schemas.changes import ChangeReport, TileChange
@@ -55,6 +57,8 @@ def merged_map(
         epoch = base.tiles.get(tile, Gaussians.empty())
         bases = {base.shas[tile]: epoch} if tile in base.shas else {}
         merged = merge_tile(epoch, statements_of(epoch, reports, bases, parameters.mode), parameters)
+        if parameters.mode == "default":
+            merged, _ = hold_season(epoch, merged, reports)
         final[tile] = hold_parked(epoch, merged, reports, NOTHING_PARKED, bases, parked_h).merged.gaussians
     return final
 
@@ -62,7 +66,8 @@ def merged_map(
 def map_of_one(base: BaseMap, bodies: Iterable[bytes], parked_h: float = PARKED_H) -> dict[TileId, Gaussians]:
     """Return the base map with what one vehicle reports, no cloud in between.
 
-    What has the shape of a standing vehicle is no change, unless `parked_h` is 0: whoever takes the report sees it.
+    What has the shape of a standing vehicle is no change, nor are leaves, unless `parked_h` is 0: whoever takes the
+    report sees it.
     """
     final = dict(base.tiles)
     for tile, reports in reports_of_tiles(bodies, MergeParameters()).items():
@@ -70,7 +75,7 @@ def map_of_one(base: BaseMap, bodies: Iterable[bytes], parked_h: float = PARKED_
         for report in reports:
             final[tile] = _with_change(final.get(tile, Gaussians.empty()), report.change)
         if parked_h > 0.0:
-            final[tile] = _without_parked(tile, before, final[tile])
+            final[tile] = _without_leaves(tile, before, _without_parked(tile, before, final[tile]))
     return final
 
 
@@ -78,6 +83,13 @@ def _without_parked(tile: TileId, before: Gaussians, after: Gaussians) -> Gaussi
     at = np.flatnonzero(~are_in(after.voxel_id, before.voxel_id))
     parked = at[has_vehicle_shape(VoxelGrid.of(tile), before, after.take(at))]
     return after.take(np.setdiff1d(np.arange(len(after)), parked))
+
+
+def _without_leaves(tile: TileId, before: Gaussians, after: Gaussians) -> Gaussians:
+    change = diff(before, after)
+    held = follows_season(VoxelGrid.of(tile), before, change.removed, change.put)
+    put = change.put.take(np.flatnonzero(~are_in(change.put.voxel_id, held)))
+    return apply(before, TileDelta(change.removed[~are_in(change.removed, held)], put))
 
 
 def _with_change(tile: Gaussians, change: TileChange) -> Gaussians:

@@ -91,7 +91,8 @@ class PoseSource:
         return f"noisy:{self.sigma_m * 100:.10g}cm:{degrees(self.sigma_rad):.10g}deg"
 
 
-Mode = Literal["default", "paper"]
+Mode = Literal["default", "paper", "paper-observers"]
+"""Whose rules; of the paper's, ξ as printed or with the observers as denominator (`gnd.cloud_merger.statements`)."""
 SET: Final = ((), Option("Replace a parameter, GROUP.FIELD=VALUE.", ("--set",), repeated=True))
 """The option `--set`, for `studies.frame.options.parts`."""
 
@@ -115,9 +116,9 @@ class MethodParameters:
     @classmethod
     def of_mode(cls, mode: Mode) -> "MethodParameters":
         """Return the parameters of a mode; movers are segmented in both, as in the paper ([50])."""
-        if mode == "paper":
-            return cls(detect=DetectParameters.paper(), merge=MergeParameters(mode="paper", eps=0.5))
-        return cls()
+        if mode == "default":
+            return cls()
+        return cls(detect=DetectParameters.paper(), merge=MergeParameters(mode=mode, eps=0.5))
 
     def with_changes(self, changes: Iterable[str]) -> "MethodParameters":
         """Return these parameters with fields replaced.
@@ -183,7 +184,7 @@ class RunOptions:
     stay_h: float = option(
         0.0, "Mean stay of a parked car in hours; 0: every drive meets others.", "--stay", span=(0, MAX_STAY_H)
     )
-    mode: Mode = option("default", "Whose rules.")
+    mode: Mode = option("default", "Whose rules; paper: ξ as printed, paper-observers: observers as its denominator.")
     poses: PoseSource = option(
         PoseSource(), "estimated, true, or noisy:<m>:<deg>; true,estimated compares.",
         read=lambda text: PoseSource.several(text)[0],

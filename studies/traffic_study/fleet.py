@@ -166,7 +166,7 @@ def _method(options: TrafficOptions, way: DrivenWay) -> Any:
 def _published(base: BaseMap, lattice: Lattice | None) -> BaseMap:
     if lattice is None:
         return base
-    return BaseMap({tile: snap(gaussians, lattice) for tile, gaussians in base.tiles.items()})
+    return BaseMap({tile: snap(gaussians, lattice, new_map=True) for tile, gaussians in base.tiles.items()})
 
 
 def _f1(truth: Truth, base: BaseMap, final: BaseMap) -> dict[Level, float]:

@@ -10,7 +10,18 @@ from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig, DriveSimulation
 from gnd.fleet_sim.sensors import MODELS
 from gnd.fleet_sim.traffic import Traffic
 from gnd.fleet_sim.world import World
-from gnd.gnd_map.codec import CODECS, LATTICES, Codec, lattice_of, snap
+from gnd.gnd_map.codec import (
+    CODEC_ARCHIVE_ZSTD,
+    CODEC_COMPACT_ZSTD,
+    CODEC_STANDARD_ZSTD,
+    LATTICES,
+    PREFERRED,
+    Codec,
+    Lattice,
+    codec_of,
+    lattice_of,
+    snap,
+)
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory
@@ -24,6 +35,7 @@ TILE_VOXELS: Final = 2_500
 _SCANS: Final = 40
 _MARGIN_M: Final = 100.0
 _EDGE_S: Final = 0.2
+ZSTD_OF: Final = {"archive": CODEC_ARCHIVE_ZSTD, "standard": CODEC_STANDARD_ZSTD, "compact": CODEC_COMPACT_ZSTD}
 
 Tiles = Mapping[TileId, Gaussians]
 
@@ -57,11 +69,11 @@ def codec_measures(world: World, tiles: Tiles, sensor_model: str) -> dict[str, C
         sensor_model: of the scans.
     """
     circle = covering_circle(world.lat_rad, world.lon_rad, world.half_length_m + _MARGIN_M)
-    grid_frame, scans = GridFrame.around(world.frame, circle), _posed_scans(world, sensor_model)
+    grid_frame, scans = GridFrame.around(world.frame, circle), scans_before(world, sensor_model)
     found = {}
     for name, lattice in LATTICES.items():
-        snapped = {tile: snap(gaussians, lattice) for tile, gaussians in tiles.items()}
-        first, second = (codec for codec in CODECS.values() if lattice_of(codec.codec_id) is lattice)
+        snapped = {tile: snap(gaussians, lattice, new_map=True) for tile, gaussians in tiles.items()}
+        first, second = codec_of(best_of(lattice)), codec_of(ZSTD_OF[name])
         encode_ms, decode_ms = _times_ms(first, snapped)
         shift = pose_shift_cm(grid_frame, tiles, snapped, scans)
         found[name] = CodecMeasures(
@@ -73,6 +85,11 @@ def codec_measures(world: World, tiles: Tiles, sensor_model: str) -> dict[str, C
             decode_ms=decode_ms,
         )
     return found
+
+
+def best_of(lattice: Lattice) -> int:
+    """Return the id of the codec that writes a lattice shortest."""
+    return next(codec_id for codec_id in PREFERRED if lattice_of(codec_id) is lattice)
 
 
 def protobuf_bytes(tiles: Tiles) -> int:
@@ -93,7 +110,7 @@ def _times_ms(codec: Codec, tiles: Tiles) -> tuple[float, float]:
     return encode_s * scale, decode_s * scale
 
 
-def _posed_scans(world: World, sensor_model: str) -> list[PosedScan]:
+def scans_before(world: World, sensor_model: str) -> list[PosedScan]:
     """Scans evenly along a drive before the changes, sweep motion removed, with their true poses."""
     traffic = Traffic.urban()
     drive = DriveSimulation(

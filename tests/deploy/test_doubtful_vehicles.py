@@ -27,7 +27,7 @@ def test_a_line_says_what_was_held_back_and_how_far_off_the_vehicle_was() -> Non
         "reports_acknowledged": 2, "reports_lost": 0, "tiles_published": 1, "updates_received": 1, "changed_voxels": 9,
         "traffic": fleet_totals([]),
         "localisation_p95": {"longitudinal_m": None}, "f1": {"before": None},
-        "waiting_for_confirmation": {"tiles": 0, "voxels": 0, "parked": 0}, "named_vehicles": [],
+        "waiting_for_confirmation": {"tiles": 0, "voxels": 0, "parked": 0, "season": 0}, "named_vehicles": [],
         "doubtful": doubtful_vehicles(FleetResults((result("car-2", 40, 5, 3, 3, 314, doubts=SHIFTED),))),
     }  # fmt: skip
     assert (

@@ -70,5 +70,10 @@ def test_the_wheel_holds_one_name_and_every_table(tmp_path: Path) -> None:
         held = {n.removeprefix("gnd/") for n in names if n.startswith(f"gnd/{name}/")}
         there = {str(p.relative_to(ROOT)) for p in (ROOT / name).rglob("*.py")}
         assert there <= held, sorted(there - held)[:5]
-    for table in ("gnd_map/codec/priors.bin", "deploy/fleet.toml", "tile_store/sql/sqlite.sql", "deploy/links.toml"):
+    for table in (
+        "gnd_map/codec/priors.bin",
+        "gnd_map/codec/prior_sets.bin",
+        "deploy/fleet.toml",
+        "tile_store/sql/sqlite.sql",
+    ):
         assert f"gnd/{table}" in names

@@ -147,6 +147,11 @@ class Localiser:
         return ("lost", self._first.cause) if self.online is None else (self.online.health, self.online.cause)
 
     @property
+    def drive(self) -> DriveState:
+        """What outlives a track: the sensors as learnt."""
+        return self._drive
+
+    @property
     def innovations(self) -> Innovations:
         """Of believed matches against the prediction: NIS."""
         return self._drive.innovations

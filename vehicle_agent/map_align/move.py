@@ -88,7 +88,10 @@ def moved_tiles(side: Side, frame: LocalFrame, T_a_b: F64, codec: str = DEFAULT_
             accumulator.add(points_m)
         found.update(accumulator.finish())
     lattice = lattice_named(codec)
-    return [Tile(tile, 1, found[tile] if lattice is None else snap(found[tile], lattice)) for tile in sorted(found)]
+    return [
+        Tile(tile, 1, found[tile] if lattice is None else snap(found[tile], lattice, new_map=True))
+        for tile in sorted(found)
+    ]
 
 
 def _samples(tile: Tile, frame: LocalFrame, T_a_b: F64) -> F64:
