@@ -9,7 +9,7 @@ SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs extras bench studies schemas clean
+.PHONY: help setup fleet test quick check docs extras bench studies schemas lock sbom audit clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -63,6 +63,25 @@ studies: setup   ## print the studies' small benchmarks with their commands: mak
 
 schemas: setup   ## generate Python from schemas/*.proto
 	$(BIN)/python -m gnd.schemas.generate
+
+TOOLS := build/tools
+$(TOOLS)/.ready:
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/pip install --quiet --disable-pip-version-check pip-tools cyclonedx-bom pip-audit
+	@touch $@
+
+LOCK = $(TOOLS)/bin/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
+  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --extra vehicle --extra cloud --extra sim --build-deps-for wheel -c constraints.txt
+
+lock: $(TOOLS)/.ready  ## pin what the image installs, by version and hash: deploy/requirements.lock
+	$(LOCK) -o deploy/requirements.lock pyproject.toml
+
+sbom: $(TOOLS)/.ready  ## list what the image installs as CycloneDX: build/sbom.cdx.json
+	$(TOOLS)/bin/cyclonedx-py requirements deploy/requirements.lock --pyproject pyproject.toml --mc-type application \
+	  --output-reproducible --of JSON -o build/sbom.cdx.json
+
+audit: $(TOOLS)/.ready  ## ask the index for known weaknesses of what the image installs (needs a network)
+	$(TOOLS)/bin/pip-audit --require-hashes --disable-pip -r deploy/requirements.lock
 
 clean:           ## remove what was made
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

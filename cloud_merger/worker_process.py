@@ -95,7 +95,8 @@ def main() -> None:
     from gnd.cloud_merger.merger import run_worker
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    os.nice(NICER)
+    with contextlib.suppress(PermissionError):  # a container or unit may forbid it: the work is done all the same
+        os.nice(NICER)
     size = int.from_bytes(_exactly(8), "little")
     config, metrics_at = pickle.loads(_exactly(size))  # noqa: S301 - written by the process that has started this one
     stop, arrived = threading.Event(), threading.Event()
