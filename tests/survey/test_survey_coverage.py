@@ -54,14 +54,31 @@ def test_a_road_on_the_map_is_covered_and_one_off_it_is_bare() -> None:
     assert share(900.0, 0.0, HERE_M) is None, "tiles that are not here yet are no hole in the map"
 
 
-def driven(*shares: tuple[float, float | None]) -> tuple[WayOffTheMap, float | None]:
+def test_a_road_that_returns_nothing_is_on_the_map_where_all_else_is() -> None:
+    """Wet asphalt: the strip is empty, the fronts that the vehicle sees are in the map."""
+    held = local_map(40.0)
+    coverage, here = RoadCoverage(held), np.array([-20.0, -1.8, HEIGHT_M])
+    seen = street_points(-40.0, 0.0)
+    share = coverage.share_held(here, seen)
+    assert share is not None
+    assert share > 0.9
+    beyond = coverage.share_held(np.array([80.0, -1.8, HEIGHT_M]), street_points(60.0, 100.0))
+    assert beyond == 0.0
+    assert coverage.share_held(here, np.empty((0, 3))) is None
+    assert coverage.share_held(np.array([900.0, 0.0, HEIGHT_M]), seen + np.array([920.0, 0.0, 0.0])) is None
+    assert not driven((60.0, 0.0), held=share)[0].is_worth
+    assert driven((60.0, 0.0), held=beyond)[0].is_worth
+    assert driven((60.0, 0.0), held=None)[0].is_worth
+
+
+def driven(*shares: tuple[float, float | None], held: float | None = 0.0) -> tuple[WayOffTheMap, float | None]:
     """Look along stretches (length in metres, share covered); also the way at which the survey ends, if it does."""
     off, way_m = WayOffTheMap(), 0.0
     for length_m, share in shares:
         for _ in range(round(length_m / LOOK_EVERY_M)):
             way_m += LOOK_EVERY_M
             assert off.is_due(way_m)
-            off.look(way_m, share)
+            off.look(way_m, share, held)
             if off.is_vain or off.is_back:
                 return off, way_m
     return off, None

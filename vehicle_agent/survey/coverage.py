@@ -17,6 +17,10 @@ COVERED: Final = 0.8
 """Share of the columns of a strip of road from which on the map covers it ..."""
 BARE: Final = 0.3
 """... and up to which the map has no road there. What lies between is a thin map: of few scans, or of few layers."""
+AROUND_M: Final = 15.0
+HELD: Final = 0.5
+"""A road that returns nothing, such as wet asphalt, is on no map. So nothing is bare where the map holds this share of
+the columns about the vehicle in which its scan finds something."""
 LEAST_BARE_M: Final = 10.0
 """Way in one piece without a road on the map from which on a survey is worth its bytes."""
 BACK_M: Final = 30.0
@@ -27,6 +31,8 @@ VAIN_M: Final = 100.0
 """A survey that has not become worth its bytes on so long a way is given up."""
 LOOK_EVERY_M: Final = 2.0
 _STEP_M: Final = 1.0
+_LEAST_POINTS: Final = 5
+"""Of a scan in a column: a single one is no thing."""
 _KNOWN: Final = 0.8
 """So many columns of a stretch must belong to tiles of which it is known whether the map has them."""
 
@@ -47,13 +53,27 @@ class RoadCoverage:
         )
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
         p = np.stack([cos * along - sin * across, sin * along + cos * across, np.zeros_like(along)], axis=-1)
+        return self._share_of(self._columns(p.reshape(-1, 3) + p_map_m))
+
+    def share_held(self, p_map_m: F64, seen_map_m: F64) -> float | None:
+        """Share of the columns about a place in which points (N, 3) of a scan lie that hold a Gaussian; None: see
+        `share`, or nothing is seen.
+        """
+        near = np.hypot(*(seen_map_m[:, :2] - p_map_m[:2]).T) < AROUND_M
+        columns, points = np.unique(self._columns(seen_map_m[near]), axis=0, return_counts=True)
+        seen = columns[points >= _LEAST_POINTS]
+        return self._share_of(seen) if len(seen) else None
+
+    def _columns(self, p_map_m: F64) -> NDArray[np.int64]:
+        g = np.floor(self.local_map.grid_frame.grid_of(p_map_m)).astype(np.int64)
+        return np.asarray(g[:, :2] - self.local_map.window_origin_g[:2])
+
+    def _share_of(self, columns: NDArray[np.int64]) -> float | None:
         best = self._seen_from_above()
-        g = np.floor(self.local_map.grid_frame.grid_of(p.reshape(-1, 3) + p_map_m)).astype(np.int64)
-        at = g[:, :2] - self.local_map.window_origin_g[:2]
-        inside = ((at >= 0) & (at < best.shape)).all(axis=1)
-        found = best[at[inside, 0], at[inside, 1]]
+        inside = ((columns >= 0) & (columns < best.shape)).all(axis=1)
+        found = best[columns[inside, 0], columns[inside, 1]]
         known = found >= EMPTY
-        if known.sum() < _KNOWN * len(at):
+        if known.sum() < _KNOWN * len(columns):
             return None
         return float((found[known] > EMPTY).mean())
 
@@ -87,12 +107,14 @@ class WayOffTheMap:
         """Whether it is time to look again."""
         return way_m - self.looked_m >= LOOK_EVERY_M
 
-    def look(self, way_m: float, share: float | None) -> None:
-        """Take the share of the road that the map covers at `way_m` from the survey's begin; None: not known."""
+    def look(self, way_m: float, share: float | None, held: float | None) -> None:
+        """Take what the map has at `way_m` from the survey's begin: its share of the road, and of what is seen about
+        it; None: not known.
+        """
         step_m, self.looked_m = way_m - self.looked_m, way_m
         if share is None:
             return
-        is_bare = share <= BARE
+        is_bare = share <= BARE and (held is None or held < HELD)
         self.bare_m += step_m if is_bare else 0.0
         self._in_one_m = self._in_one_m + step_m if is_bare else 0.0
         self._since_bare_m = 0.0 if is_bare else self._since_bare_m + step_m

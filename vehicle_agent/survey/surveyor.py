@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import transform
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.drive import DriveItem, GnssFix, Scan
 from gnd.schemas.keys import change_key
@@ -27,7 +28,7 @@ from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter
 from gnd.vehicle_agent.survey.chain import ClosedSubmap, SubmapChain
 from gnd.vehicle_agent.survey.coverage import AHEAD_M, BARE, COVERED, HERE_M, LOOK_EVERY_M, RoadCoverage, WayOffTheMap
-from gnd.vehicle_agent.survey.odometry import SurveyOdometry
+from gnd.vehicle_agent.survey.odometry import OdometryScan, SurveyOdometry
 
 _SETTLED_NS: Final = 12_000_000_000
 """Final poses of the localiser, and what moves, are known so long after a scan."""
@@ -147,13 +148,14 @@ class Surveyor:
             online = self._localiser.online
             if online is not None and online.health == "good" and online.t_ns == placed.t_ns:
                 survey.T_map_odom = online.T_map_vehicle @ np.linalg.inv(placed.T_odom_vehicle)
-            self._measure(survey, placed.way_m)
+            self._measure(survey, placed)
 
-    def _measure(self, survey: _Survey, way_m: float) -> None:
+    def _measure(self, survey: _Survey, scan: OdometryScan) -> None:
         """Count the way on the map and off it."""
-        if survey.off.is_due(way_m):
-            place = survey.at(survey.odometry.newest_ns or survey.start_ns)
-            survey.off.look(way_m, self._share(place, HERE_M))
+        if survey.off.is_due(scan.way_m):
+            place = survey.T_map_odom @ scan.T_odom_vehicle
+            held = self._coverage.share_held(place[:3, 3], transform(survey.T_map_odom, scan.points_m))
+            survey.off.look(scan.way_m, self._share(place, HERE_M), held)
 
     def _look(self, survey: _Survey, now_ns: int) -> None:
         """End what has come back to the map, or never left it; report what is settled."""
