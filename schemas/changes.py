@@ -217,8 +217,8 @@ class ChangeReport:
             change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
         )
         check_major(message, "ChangeReport")
-        if any(message.HasField(form) for form in ("packed", "gaussians", "features")):
-            raise BadValue("ChangeReport in short (packed, gaussians) or of features: here only a whole report is read")
+        if any(message.HasField(form) for form in ("packed", "gaussians", "features", "survey")):
+            raise BadValue("ChangeReport in short, of features or of a survey: here only a whole report is read")
         check_length("ChangeReport", len(message.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
         with refusing("ChangeReport"):
             district = District(message.district)
