@@ -18,6 +18,7 @@ from gnd.tile_store.feature_io.osm_change import apply_osm_change
 from gnd.tile_store.feature_io.osm_document import MAX_FILE_BYTES
 from gnd.tile_store.feature_io.stored import layer_tiles
 from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions, default_source
+from gnd.tile_store.feature_io.whole_file import write_whole
 from gnd.tile_store.feature_io.xml_spans import read_bytes
 from gnd.tile_store.options import to_read
 from gnd.vehicle_agent.features.lanes.lane_mapper import MARKINGS
@@ -84,7 +85,7 @@ def edits(
     found = lane_edits(read, tiles, name, options)
     for target, data in ((out, found.change.data), (edited, found.edited)):
         if target is not None:
-            _write(target, data)
+            write_whole(target, data)
     show(_values(found), as_json, lambda console: _print(console, found, out))
 
 
@@ -96,15 +97,8 @@ def apply(file: Path, change: Path, out: Path) -> None:
     """Write MAP.osm with all edits of EDITS.osc to OUT.osm; an edit that does not fit refuses all."""
     limit = MAX_FILE_BYTES
     data = apply_osm_change(read_bytes(file, limit), read_bytes(change, limit), str(file))
-    _write(out, data)
+    write_whole(out, data)
     click.echo(f"{out}: {len(data)} bytes")
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise FeatureFileError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _values(found: MapEdits) -> dict[str, Any]:

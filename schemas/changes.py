@@ -6,7 +6,6 @@ change, too.
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -24,18 +23,16 @@ from gnd.schemas.course import Course, course_message, course_value
 from gnd.schemas.doubt import Doubt, doubt_message, doubt_value
 from gnd.schemas.errors import BadValue, TooLarge
 from gnd.schemas.generated import change_ack_pb2, change_report_pb2, tile_change_pb2
+from gnd.schemas.report_head import check_report_head, check_tiles_of_district
 from gnd.schemas.report_id import check_report_id
 from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
-    PRINTABLE_PATTERN,
     REASON_PATTERN,
-    VEHICLE_PATTERN,
     check_length,
     check_major,
     check_pair,
     check_text,
-    check_unsigned,
     check_word,
     number_of,
     parse,
@@ -191,30 +188,10 @@ class ChangeReport:
     """Where the vehicle drives in its own frame; None = it does not know."""
 
     def __post_init__(self) -> None:
-        check_report_id(self.report_id)
-        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
-        check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
-        check_text("software", self.software, PRINTABLE_PATTERN)
+        check_report_head(self)
         check_text("layer", self.layer, LAYER_PATTERN)
-        check_unsigned("first_ns", self.first_ns, bits=63)
-        check_unsigned("last_ns", self.last_ns, bits=63)
-        if self.first_ns > self.last_ns:
-            raise BadValue(f"report {self.report_id} begins at {self.first_ns} ns, after its end at {self.last_ns} ns")
-        self._check_tiles()
-
-    def _check_tiles(self) -> None:
-        check_length(f"report {self.report_id}", len(self.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
+        check_tiles_of_district(self.report_id, self.district, self.tiles)
         _check_observed(sum(len(change.observed) for change in self.tiles), len(self.tiles))
-        if not self.tiles:
-            raise BadValue(f"report {self.report_id} has no tiles")
-        for before, after in pairwise(self.tiles):
-            if before.tile >= after.tile:
-                raise BadValue(
-                    f"report {self.report_id} lists tile {after.tile} after {before.tile}: ascending, none twice"
-                )
-        outside = [change.tile for change in self.tiles if not self.district.contains(change.tile)]
-        if outside:
-            raise BadValue(f"report {self.report_id}: tile {outside[0]} is not in district {self.district}")
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeReport."""
@@ -240,8 +217,8 @@ class ChangeReport:
             change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
         )
         check_major(message, "ChangeReport")
-        if any(message.HasField(form) for form in ("packed", "gaussians", "features")):
-            raise BadValue("ChangeReport in short (packed, gaussians) or of features: here only a whole report is read")
+        if any(message.HasField(form) for form in ("packed", "gaussians", "features", "survey")):
+            raise BadValue("ChangeReport in short, of features or of a survey: here only a whole report is read")
         check_length("ChangeReport", len(message.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
         with refusing("ChangeReport"):
             district = District(message.district)

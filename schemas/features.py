@@ -7,10 +7,7 @@ needs those who looked and saw nothing. On the wire it is a ChangeReport with no
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Final
-
-from ulid import ULID
 
 from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.tile_id import District, TileId
@@ -19,16 +16,14 @@ from gnd.schemas.errors import BadValue
 from gnd.schemas.feature_change import EVERY_CELL, GRID, FeatureChange, Found, Seen, cell_of
 from gnd.schemas.feature_wire import change_message, change_of
 from gnd.schemas.generated import change_report_pb2, feature_change_pb2, feature_report_pb2
-from gnd.schemas.report_id import check_report_id, report_id_of_bytes
+from gnd.schemas.report_head import check_report_head, check_tiles_of_district
+from gnd.schemas.report_id import bytes_of_report_id, report_id_of_bytes
 from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
-    PRINTABLE_PATTERN,
-    VEHICLE_PATTERN,
     check_length,
     check_major,
     check_text,
-    check_unsigned,
     parse,
     refusing,
     serialise,
@@ -74,32 +69,12 @@ class FeatureReport:
     """One entry a tile, ascending; at least one."""
 
     def __post_init__(self) -> None:
-        check_report_id(self.report_id)
-        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
-        check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
-        check_text("software", self.software, PRINTABLE_PATTERN)
+        check_report_head(self)
         check_text("layer", self.layer, LAYER_PATTERN)
         if not is_feature_layer(self.layer):
             raise BadValue(f"report {self.report_id} speaks of features, layer {self.layer!r} holds Gaussians")
-        check_unsigned("first_ns", self.first_ns, bits=63)
-        check_unsigned("last_ns", self.last_ns, bits=63)
-        if self.first_ns > self.last_ns:
-            raise BadValue(f"report {self.report_id} begins at {self.first_ns} ns, after its end at {self.last_ns} ns")
-        self._check_tiles()
-
-    def _check_tiles(self) -> None:
-        if not self.tiles:
-            raise BadValue(f"report {self.report_id} has no tiles")
-        check_length(f"report {self.report_id}", len(self.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
+        check_tiles_of_district(self.report_id, self.district, self.tiles)
         _check_amount(sum(one.n_features for one in self.tiles), sum(one.n_points for one in self.tiles))
-        for before, after in pairwise(self.tiles):
-            if before.tile >= after.tile:
-                raise BadValue(
-                    f"report {self.report_id} lists tile {after.tile} after {before.tile}: ascending, none twice"
-                )
-        outside = [change.tile for change in self.tiles if not self.district.contains(change.tile)]
-        if outside:
-            raise BadValue(f"report {self.report_id}: tile {outside[0]} is not in district {self.district}")
 
     def snapped(self) -> "FeatureReport":
         """As it is after a journey: positions in whole millimetres, masses in 1/10,000, covariances on levels."""
@@ -112,7 +87,7 @@ class FeatureReport:
             TooLarge: a reader would refuse them.
         """
         features = feature_report_pb2.FeatureReport(
-            report_id=bytes(ULID.from_str(self.report_id).bytes),
+            report_id=bytes_of_report_id(self.report_id),
             vehicle=self.vehicle,
             sensor_model=self.sensor_model,
             software=self.software,

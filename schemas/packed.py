@@ -12,8 +12,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from ulid import ULID
-
 from gnd.gnd_map.codec import decode_tiles, encode_tiles
 from gnd.schemas import limits
 from gnd.schemas.changes import ChangeReport
@@ -22,15 +20,13 @@ from gnd.schemas.doubt import Doubt, doubt_message, doubt_value
 from gnd.schemas.errors import BadValue, TooLarge
 from gnd.schemas.features import FeatureReport, check_feature_bytes, report_of
 from gnd.schemas.generated import change_report_pb2, packed_gaussians_pb2, packed_report_pb2
-from gnd.schemas.report_id import check_report_id, report_id_of_bytes
+from gnd.schemas.report_head import check_report_head
+from gnd.schemas.report_id import bytes_of_report_id, check_report_id, report_id_of_bytes
 from gnd.schemas.survey import SURVEY_FIELD, SurveyReport, check_survey_bytes
 from gnd.schemas.wire import (
     MAJOR,
-    PRINTABLE_PATTERN,
-    VEHICLE_PATTERN,
     check_length,
     check_major,
-    check_text,
     check_unsigned,
     check_version,
     parse,
@@ -83,12 +79,7 @@ class PackedReport:
     """Where the vehicle drives in its own frame; None = it does not know."""
 
     def __post_init__(self) -> None:
-        check_report_id(self.report_id)
-        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
-        check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
-        check_text("software", self.software, PRINTABLE_PATTERN)
-        check_unsigned("first_ns", self.first_ns, bits=63)
-        check_unsigned("last_ns", self.last_ns, bits=63)
+        check_report_head(self)
         check_unsigned("pose_sigma_tenth_mm", self.pose_sigma_tenth_mm, bits=_SIGMA_BITS)
         check_unsigned("pose_sigma_10urad", self.pose_sigma_10urad, bits=_SIGMA_BITS)
         if len(self.base_digest) != DIGEST_BYTES:
@@ -140,7 +131,7 @@ class PackedReport:
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeReport with `packed` set."""
         packed = packed_report_pb2.PackedReport(
-            report_id=_ulid_bytes(self.report_id),
+            report_id=bytes_of_report_id(self.report_id),
             vehicle=self.vehicle,
             sensor_model=self.sensor_model,
             software=self.software,
@@ -186,7 +177,7 @@ class PackedGaussians:
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeReport with `gaussians` set."""
         gaussians = packed_gaussians_pb2.PackedGaussians(
-            report_id=_ulid_bytes(self.report_id), measured=self.measured, wanted_crc=self.wanted_crc
+            report_id=bytes_of_report_id(self.report_id), measured=self.measured, wanted_crc=self.wanted_crc
         )
         message = change_report_pb2.ChangeReport(major=MAJOR, gaussians=gaussians)
         return serialise(message, limits.MAX_PACKED_GAUSSIANS_BYTES)
@@ -267,7 +258,3 @@ def _packed_gaussians(message: packed_gaussians_pb2.PackedGaussians) -> PackedGa
 def _check_size(name: str, data: bytes, limit: int) -> None:
     if len(data) > limit:
         raise TooLarge(f"{name} of {len(data)} bytes exceeds the limit of {limit} bytes")
-
-
-def _ulid_bytes(report_id: str) -> bytes:
-    return bytes(ULID.from_str(report_id).bytes)

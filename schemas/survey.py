@@ -11,7 +11,6 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from ulid import ULID
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import is_feature_layer
@@ -22,12 +21,11 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import limits
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import change_report_pb2, survey_anchor_pb2, survey_report_pb2, survey_submap_pb2
+from gnd.schemas.report_head import check_report_head
 from gnd.schemas.report_id import bytes_of_report_id, check_report_id, report_id_of_bytes
 from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
-    PRINTABLE_PATTERN,
-    VEHICLE_PATTERN,
     check_length,
     check_major,
     check_text,
@@ -159,11 +157,8 @@ class SurveyReport:
     anchors: tuple[SurveyAnchor, ...] = ()
 
     def __post_init__(self) -> None:
-        for report_id in (self.report_id, self.survey_id):
-            check_report_id(report_id)
-        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
-        check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
-        check_text("software", self.software, PRINTABLE_PATTERN)
+        check_report_head(self)
+        check_report_id(self.survey_id)
         check_text("layer", self.layer, LAYER_PATTERN)
         if is_feature_layer(self.layer):
             raise BadValue(f"survey {self.survey_id} maps Gaussians, layer {self.layer!r} holds features")
@@ -172,8 +167,6 @@ class SurveyReport:
         if (self.part == 0) != (self.report_id == self.survey_id):
             raise BadValue(f"part {self.part} of survey {self.survey_id} is report {self.report_id}: the first part "
                            "gives the survey its id")  # fmt: skip
-        check_unsigned("first_ns", self.first_ns, bits=63)
-        check_unsigned("last_ns - first_ns", self.last_ns - self.first_ns, bits=63)
         self._check_submaps()
 
     def _check_submaps(self) -> None:
@@ -193,7 +186,7 @@ class SurveyReport:
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeReport with `survey` set; `TooLarge` when a reader would refuse them."""
         survey = survey_report_pb2.SurveyReport(
-            report_id=bytes(ULID.from_str(self.report_id).bytes),
+            report_id=bytes_of_report_id(self.report_id),
             survey_id=bytes_of_report_id(self.survey_id),
             part=self.part,
             is_last=self.is_last,

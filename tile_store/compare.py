@@ -32,7 +32,7 @@ class MapInfo:
     districts: int
     gaussians: int
     points: int
-    """Raw points that the Gaussians stand for; on a lattice to within an octave each."""
+    """Raw points that the Gaussians stand for; on a lattice within a factor of two each (*compact*: of three)."""
     body_bytes: int
     bytes_a_voxel: float
     """Of the bodies as they lie in the store; 0 without voxels."""

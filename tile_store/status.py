@@ -1,5 +1,7 @@
 """`gnd map status`: what a map is waiting for."""
 
+from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -46,9 +48,8 @@ def status(path: Path, as_json: bool) -> None:
 
 def status_of(store: Store) -> dict[str, Any]:
     """How the store stands, in plain values; each key is one table or line of `gnd map status`."""
-    claims = [
-        asdict(one) | {"tile": one.tile.path, "doubts": _doubts_of(store, one)} for one in store.waiting_changes()
-    ]
+    waiting = store.waiting_changes()
+    claims = [asdict(one) | {"tile": one.tile.path, "doubts": _doubts_of(store, one)} for one in waiting]
     state, counts = store.queue_state(), store.counts()
     return {
         "shards": [asdict(one) | {"is_alive": one.is_alive} for one in store.shards()],
@@ -60,7 +61,7 @@ def status_of(store: Store) -> dict[str, Any]:
         },
         "merge_lag_s": {"p50": state.lag_s(0.5), "p95": state.lag_s(0.95), "max": state.lag_s(1.0)},
         "set_aside": [asdict(one) | {"tile": one.tile.path} for one in store.tiles_set_aside()],
-        "waiting_for_confirmation": waiting_totals(store) | {"claims": claims},
+        "waiting_for_confirmation": _totals(waiting) | {"claims": claims},
         "named_vehicles": named_vehicles(store),
         "to_merge": [asdict(one) | {"tile": one.tile.path} for one in store.dirty_tiles()],
         "uploads": dict(store.upload_counts().by_state),
@@ -99,12 +100,16 @@ def waiting_totals(store: Store) -> dict[str, int]:
     """How many tiles and voxels wait for a second witness, how many voxels for having stood long enough, and how many
     follow the season; a voxel counts once for each vehicle that claims it.
     """
-    waiting = [one for one in store.waiting_changes() if one.reason not in ("parked", "season")]
-    parked, season = (
-        sum(one.voxels for one in store.waiting_changes() if one.reason == r) for r in ("parked", "season")
-    )
-    tiles = {(one.layer, one.tile) for one in waiting}
-    return {"tiles": len(tiles), "voxels": sum(one.voxels for one in waiting), "parked": parked, "season": season}
+    return _totals(store.waiting_changes())
+
+
+def _totals(waiting: Sequence[WaitingChange]) -> dict[str, int]:
+    held = Counter[WaitingReason]()
+    for one in waiting:
+        held[one.reason] += one.voxels
+    parked, season = held.pop("parked", 0), held.pop("season", 0)
+    tiles = {(one.layer, one.tile) for one in waiting if one.reason in held}
+    return {"tiles": len(tiles), "voxels": held.total(), "parked": parked, "season": season}
 
 
 def named_vehicles(store: Store) -> list[dict[str, Any]]:

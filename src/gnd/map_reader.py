@@ -44,7 +44,8 @@ class GaussianColumns:
         lat_deg: (N,) float64 WGS-84 latitudes of the means, degrees.
         lon_deg: (N,) float64 longitudes, degrees.
         height_m: (N,) float64 heights above the ellipsoid, m.
-        count: (N,) int32 points that the Gaussian was made of; of published tiles to within an octave.
+        count: (N,) int32 points that the Gaussian was made of; of published tiles within a factor of two (*compact*:
+            of three).
         cells: (N,) int32 how many 10 cm cells of the voxel hold points: its support.
         day: (N,) datetime64[D] when the world was last seen so (of the tile's version); NaT where nobody knows.
         reports: (N,) int32 how many reports of vehicles the tile's version was made of; 0: it was built of a survey.

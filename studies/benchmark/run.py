@@ -232,7 +232,7 @@ def _gaussian_maps(
     options: EntryOptions,
 ) -> tuple[Tiles, list[Tiles], Tiles]:
     method = MethodParameters.of_mode(options.mode)
-    single: list[Tiles] = [map_of_one(base, one.bodies, method.parked_h) for one in driven]
+    single: list[Tiles] = [map_of_one(base, one.bodies, method.merge, method.parked_h) for one in driven]
     bodies = [body for one in together for body in one.bodies]
     return base.tiles, single, merged_map(base, bodies, method.merge, method.parked_h)
 

@@ -57,25 +57,30 @@ def merged_map(
         epoch = base.tiles.get(tile, Gaussians.empty())
         bases = {base.shas[tile]: epoch} if tile in base.shas else {}
         merged = merge_tile(epoch, statements_of(epoch, reports, bases, parameters.mode), parameters)
-        if parameters.mode == "default":
+        if not parameters.has_paper_rules:
             merged, _ = hold_season(epoch, merged, reports)
         final[tile] = hold_parked(epoch, merged, reports, NOTHING_PARKED, bases, parked_h).merged.gaussians
     return final
 
 
-def map_of_one(base: BaseMap, bodies: Iterable[bytes], parked_h: float = PARKED_H) -> dict[TileId, Gaussians]:
+def map_of_one(
+    base: BaseMap, bodies: Iterable[bytes], parameters: MergeParameters, parked_h: float = PARKED_H
+) -> dict[TileId, Gaussians]:
     """Return the base map with what one vehicle reports, no cloud in between.
 
-    What has the shape of a standing vehicle is no change, nor are leaves, unless `parked_h` is 0: whoever takes the
-    report sees it.
+    Whoever takes a report sees in it what `merged_map` holds back: leaves, unless the rules are the paper's, and what
+    has the shape of a standing vehicle, unless `parked_h` is 0.
     """
     final = dict(base.tiles)
-    for tile, reports in reports_of_tiles(bodies, MergeParameters()).items():
-        before = final.get(tile, Gaussians.empty())
+    for tile, reports in reports_of_tiles(bodies, parameters).items():
+        before = after = base.tiles.get(tile, Gaussians.empty())
         for report in reports:
-            final[tile] = _with_change(final.get(tile, Gaussians.empty()), report.change)
+            after = _with_change(after, report.change)
+        if not parameters.has_paper_rules:
+            after = _without_leaves(tile, before, after)
         if parked_h > 0.0:
-            final[tile] = _without_leaves(tile, before, _without_parked(tile, before, final[tile]))
+            after = _without_parked(tile, before, after)
+        final[tile] = after
     return final
 
 

@@ -47,7 +47,7 @@ def draw_changes(outcome: SimulationOutcome, world: WorldOutcome, truth: Truth, 
         f"F1 {scored.f1():.2f} % of observable voxels" for scored in (world.single[one.vehicle], world.fleet[n])
     )
     pictures = (
-        ("single.png", ellipsoids_of_maps(truth.frame, base.tiles, map_of_one(base, one.reports, parked_h)),
+        ("single.png", ellipsoids_of_maps(truth.frame, base.tiles, map_of_one(base, one.reports, merge, parked_h)),
          f"One drive, {one.sensor}", alone),
         ("merged.png", ellipsoids_of_maps(truth.frame, base.tiles, merged), f"{n} vehicles", fleet),
         ("truth.png", true, "Truth", f"world seed {world.seed}"),

@@ -155,7 +155,7 @@ def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bo
     """Return the class, uint8 (V,), of each voxel after the vehicles' reports, merged or of one vehicle alone."""
     bodies = [body for vehicle in vehicles for body in vehicle.reports]
     parked_h, merging = case.method.parked_h, case.method.merge
-    final = merged_map(case.base, bodies, merging, parked_h) if merge else map_of_one(case.base, bodies, parked_h)
+    final = (merged_map if merge else map_of_one)(case.base, bodies, merging, parked_h)
     return classes_of_maps(case.truth, case.base.tiles, final)
 
 

@@ -106,13 +106,15 @@ class MapScorer:
         return Scored.of(evaluation, {n: int(v.sum()) for n, v in where.items()} | {"false_elsewhere": elsewhere})
 
 
-def score_single(files: WorldFiles, vehicles: Sequence[VehicleFile], parked_h: float) -> dict[str, Scored]:
+def score_single(
+    files: WorldFiles, vehicles: Sequence[VehicleFile], merge: MergeParameters, parked_h: float
+) -> dict[str, Scored]:
     """Return the stale map's score and that of each vehicle alone, by name."""
     scorer = MapScorer(files)
     found = {STALE: scorer.score(scorer.base.tiles)}
     for vehicle in vehicles:
         result = vehicle.read()
-        found[result.vehicle] = scorer.score(map_of_one(scorer.base, result.reports, parked_h))
+        found[result.vehicle] = scorer.score(map_of_one(scorer.base, result.reports, merge, parked_h))
     return found
 
 

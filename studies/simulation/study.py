@@ -122,7 +122,7 @@ def _scores(
     shares = [share for k in range(bench.processes) if (share := list(many[k :: bench.processes]))]
     jobs, merge, upload, parked_h = [], options.method.merge, options.upload, options.method.parked_h
     for seed, of_world in vehicles.items():
-        jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world, parked_h)))
+        jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world, merge, parked_h)))
         jobs += [
             Job(f"merges, world {seed}", score_fleet, (files[seed], of_world, share, merge, upload, parked_h))
             for share in shares

@@ -84,6 +84,17 @@ def test_what_does_not_fit_is_refused(inside, error):
         apply_osm_change(BEFORE, b'<osmChange version="0.6">' + inside + b"</osmChange>")
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_utf_16_is_refused_whether_it_says_so_or_not(encoding):
+    """The places of its elements are not those of its bytes."""
+    change = osm_change(BEFORE, AFTER).data
+    for text in ("\ufeff" + change.decode().split("\n", 1)[1], change.decode()):
+        with pytest.raises(FeatureFileError):
+            apply_osm_change(BEFORE, text.encode(encoding))
+        with pytest.raises(FeatureFileError):
+            read_osm(text.replace("osmChange", "osm").encode(encoding), "map")
+
+
 def test_other_files_and_torn_ones_are_refused():
     with pytest.raises(UnknownFormat, match="osmChange"):
         apply_osm_change(BEFORE, BEFORE)

@@ -1,5 +1,7 @@
 """Where the map has a road: on it, off it, and not known yet; and the chain of submaps of a vehicle without a map."""
 
+import gc
+
 import numpy as np
 import pytest
 from survey_street import FRAME, HEIGHT_M, published_map, street_points
@@ -12,8 +14,16 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter
-from gnd.vehicle_agent.survey.chain import SUBMAP_M, SubmapChain
-from gnd.vehicle_agent.survey.coverage import AHEAD_M, HERE_M, RoadCoverage
+from gnd.vehicle_agent.survey.chain import SUBMAP_M, GrowingSubmap, SubmapChain
+from gnd.vehicle_agent.survey.coverage import (
+    AHEAD_M,
+    HERE_M,
+    LOOK_EVERY_M,
+    THIN_BACK_M,
+    VAIN_M,
+    RoadCoverage,
+    WayOffTheMap,
+)
 from gnd.vehicle_agent.survey.odometry import OdometryScan
 
 
@@ -42,6 +52,65 @@ def test_a_road_on_the_map_is_covered_and_one_off_it_is_bare() -> None:
     assert share(38.0, np.pi, AHEAD_M) == 1.0
     assert share(80.0, 0.0, HERE_M) == 0.0
     assert share(900.0, 0.0, HERE_M) is None, "tiles that are not here yet are no hole in the map"
+
+
+def test_a_road_that_returns_nothing_is_on_the_map_where_all_else_is() -> None:
+    """Wet asphalt: the strip is empty, the fronts that the vehicle sees are in the map."""
+    held = local_map(40.0)
+    coverage, here = RoadCoverage(held), np.array([-20.0, -1.8, HEIGHT_M])
+    seen = street_points(-40.0, 0.0)
+    share = coverage.share_held(here, seen)
+    assert share is not None
+    assert share > 0.9
+    beyond = coverage.share_held(np.array([80.0, -1.8, HEIGHT_M]), street_points(60.0, 100.0))
+    assert beyond == 0.0
+    assert coverage.share_held(here, np.empty((0, 3))) is None
+    assert coverage.share_held(np.array([900.0, 0.0, HEIGHT_M]), seen + np.array([920.0, 0.0, 0.0])) is None
+    assert not driven((60.0, 0.0), held=share)[0].is_worth
+    assert driven((60.0, 0.0), held=beyond)[0].is_worth
+    assert driven((60.0, 0.0), held=None)[0].is_worth
+
+
+def driven(*shares: tuple[float, float | None], held: float | None = 0.0) -> tuple[WayOffTheMap, float | None]:
+    """Look along stretches (length in metres, share covered); also the way at which the survey ends, if it does."""
+    off, way_m = WayOffTheMap(), 0.0
+    for length_m, share in shares:
+        for _ in range(round(length_m / LOOK_EVERY_M)):
+            way_m += LOOK_EVERY_M
+            assert off.is_due(way_m)
+            off.look(way_m, share, held)
+            if off.is_vain or off.is_back:
+                return off, way_m
+    return off, None
+
+
+def test_a_hole_in_the_map_is_surveyed_and_ends_where_the_map_has_the_road_again() -> None:
+    assert driven((20.0, 0.9), (30.0, 0.1))[0].is_worth
+    off, end_m = driven((20.0, 0.9), (100.0, 0.0), (200.0, 1.0))
+    assert (off.is_worth, off.bare_m, end_m) == (True, 100.0, 150.0)
+    off, end_m = driven((100.0, 0.0), (200.0, 0.5))
+    assert (off.is_worth, end_m) == (True, 100.0 + THIN_BACK_M), "a thin map never covers the road, but has it"
+    assert driven((40.0, 0.0), (1000.0, None))[1] is None, "tiles that are not here yet say nothing"
+
+
+def test_a_thin_map_with_dips_costs_no_bytes_and_is_given_up() -> None:
+    """A map of few scans has half of the columns, here and there only a quarter: the road is on it."""
+    off, end_m = driven(*[(20.0, 0.5), (6.0, 0.25)] * 50)
+    assert (off.is_worth, off.is_vain, end_m) == (False, True, VAIN_M)
+    assert driven((VAIN_M, None))[0].is_vain
+
+
+def test_submaps_that_are_closed_are_no_longer_in_memory() -> None:
+    """On a road that the map does not have no final pose comes that would take scans off the chain's list."""
+    chain = SubmapChain(MotionSegmenter(SegmentParameters(enabled=False)), FRAME)
+    nothing, most = np.zeros((1, 3)), 0
+    for n in range(600):  # ten minutes, 1.2 km
+        place = T_from_R_t(np.eye(3), [2.0 * n, 0.0, 0.0])
+        chain.take(OdometryScan(n * 10**9, place, 2.0 * n, True, nothing + place[:3, 3], nothing + place[:3, 3]))
+        chain.closed((n - 12) * 10**9)
+        if n % 100 == 99:
+            most = max(most, sum(isinstance(one, GrowingSubmap) for one in gc.get_objects()))
+    assert most <= 6
 
 
 def chain_of(way_m: float, blind_from_m: float = np.inf) -> SubmapChain:

@@ -24,6 +24,7 @@ _ENTITIES: Final = (
     ("\t", "&#9;"),
     ("\r", "&#13;"),
 )
+_UTF_16_MARKS: Final = (b"\xff\xfe", b"\xfe\xff")
 _ENCODINGS: Final = (None, "utf-8", "us-ascii")
 
 
@@ -66,6 +67,8 @@ def read_root(data: bytes, where: str, on_child: Handler | None = None) -> Eleme
         FileTooLarge: elements lie too deep.
     """
     reading = _XmlReading(data, where, on_child)
+    if data[:2] in _UTF_16_MARKS or b"\0" in data[:4]:  # expat would read it, and places would not be those of tags
+        raise UnknownFormat(f"{where}: UTF-16 or UTF-32; maps are UTF-8")
     parser = expat.ParserCreate()
     parser.buffer_text = True
     parser.XmlDeclHandler = reading.declaration

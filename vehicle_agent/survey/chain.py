@@ -30,6 +30,8 @@ _ANCHOR_M, _ANCHOR_RAD = 0.03, np.array([2e-3, 2e-3, 1e-3])
 MAX_ANCHOR_M: Final = 0.10
 """A localiser that knows its place no better than this gives no anchor."""
 FIX_EVERY_M: Final = 5.0
+_REMEMBERED_NS: Final = 30_000_000_000
+"""Which submap a scan went into is known for so long: by then its pose is final, and what moves in it is found."""
 
 
 @dataclass(slots=True, eq=False)
@@ -83,6 +85,8 @@ class SubmapChain:
         here.blind_m += 0.0 if scan.seen else scan.way_m - self._way_m
         here.last_ns, self._way_m = scan.t_ns, scan.way_m
         self._of_scan.append((scan.t_ns, scan.T_odom_vehicle, here))
+        while self._of_scan[0][0] < scan.t_ns - _REMEMBERED_NS:  # each holds its submap's points
+            self._of_scan.popleft()
         if scan.way_m - self._added_way_m >= ADDED_M:
             self._added_way_m = scan.way_m
             estimate = PoseEstimate(scan.t_ns, scan.T_odom_vehicle, 0.0, 0.0, 1.0, "good")

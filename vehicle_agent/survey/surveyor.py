@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import transform
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.drive import DriveItem, GnssFix, Scan
 from gnd.schemas.keys import change_key
@@ -26,18 +27,9 @@ from gnd.vehicle_agent.report.sink import ReportSink
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter
 from gnd.vehicle_agent.survey.chain import ClosedSubmap, SubmapChain
-from gnd.vehicle_agent.survey.coverage import AHEAD_M, HERE_M, RoadCoverage
-from gnd.vehicle_agent.survey.odometry import SurveyOdometry
+from gnd.vehicle_agent.survey.coverage import AHEAD_M, BARE, COVERED, HERE_M, LOOK_EVERY_M, RoadCoverage, WayOffTheMap
+from gnd.vehicle_agent.survey.odometry import OdometryScan, SurveyOdometry
 
-COVERED: Final = 0.8
-"""Share of the columns of a strip of road from which on the map covers it ..."""
-BARE: Final = 0.3
-"""... and up to which the map has no road there."""
-LEAST_BARE_M: Final = 10.0
-"""Way without a road on the map from which on a survey is worth its bytes."""
-BACK_M: Final = 30.0
-"""A survey ends once the map has covered the road for so long a way: its submaps there lie on the map."""
-_LOOK_EVERY_M: Final = 2.0
 _SETTLED_NS: Final = 12_000_000_000
 """Final poses of the localiser, and what moves, are known so long after a scan."""
 _PART_BYTES: Final = MAX_SURVEY_REPORT_BYTES // 3
@@ -54,9 +46,7 @@ class _Survey:
     chain: SubmapChain
     T_map_odom: F64
     district: District
-    bare_m: float = 0.0
-    covered_m: float = 0.0
-    looked_m: float = 0.0
+    off: WayOffTheMap = field(default_factory=WayOffTheMap)
     waiting: list[ClosedSubmap] = field(default_factory=list)
     parts: int = 0
     survey_id: str = ""
@@ -124,7 +114,7 @@ class Surveyor:
 
     def _leaves_the_map(self, place: Place) -> bool:
         """Whether the map has no road here or ahead; looked at after every few metres."""
-        if place.heading_rad is None or place.odometer_m - self._looked_m < _LOOK_EVERY_M:
+        if place.heading_rad is None or place.odometer_m - self._looked_m < LOOK_EVERY_M:
             return False
         self._looked_m = place.odometer_m
         if not np.array_equal(self._localiser.drive.mounting.T_used, self._mount):
@@ -158,25 +148,20 @@ class Surveyor:
             online = self._localiser.online
             if online is not None and online.health == "good" and online.t_ns == placed.t_ns:
                 survey.T_map_odom = online.T_map_vehicle @ np.linalg.inv(placed.T_odom_vehicle)
-            self._measure(survey, placed.way_m)
+            self._measure(survey, placed)
 
-    def _measure(self, survey: _Survey, way_m: float) -> None:
+    def _measure(self, survey: _Survey, scan: OdometryScan) -> None:
         """Count the way on the map and off it."""
-        step_m = way_m - survey.looked_m
-        if step_m < _LOOK_EVERY_M:
-            return
-        survey.looked_m, share = way_m, self._share(survey.at(survey.odometry.newest_ns or survey.start_ns), HERE_M)
-        if share is None:
-            return
-        survey.bare_m += step_m if share <= BARE else 0.0
-        survey.covered_m = survey.covered_m + step_m if share >= COVERED else 0.0
+        if survey.off.is_due(scan.way_m):
+            place = survey.T_map_odom @ scan.T_odom_vehicle
+            held = self._coverage.share_held(place[:3, 3], transform(survey.T_map_odom, scan.points_m))
+            survey.off.look(scan.way_m, self._share(place, HERE_M), held)
 
     def _look(self, survey: _Survey, now_ns: int) -> None:
-        """End what has come back to the map; report what is settled."""
-        if survey.covered_m >= BACK_M and self._is_covered_ahead(survey, now_ns):
+        """End what has come back to the map, or never left it; report what is settled."""
+        if survey.off.is_vain or (survey.off.is_back and self._is_covered_ahead(survey, now_ns)):
             self._end(survey)
-            return
-        if survey.bare_m >= LEAST_BARE_M:
+        elif survey.off.is_worth:
             survey.waiting += survey.chain.closed(now_ns - _SETTLED_NS)
             self._report(survey, is_last=False)
 
@@ -189,15 +174,15 @@ class Surveyor:
         return self._coverage.share(T_map_vehicle[:3, 3], heading_rad, stretch_m)
 
     def _end(self, survey: _Survey) -> None:
-        self._survey, self._looked_m = None, self._looked_m + _LOOK_EVERY_M
-        if survey.bare_m < LEAST_BARE_M:
+        self._survey, self._looked_m = None, self._looked_m + LOOK_EVERY_M
+        if not survey.off.is_worth:
             self.counts["in_vain"] += 1
             return
         survey.waiting += survey.chain.closed(None)
         while survey.waiting:
             self._report(survey, is_last=True)
         self.counts["surveys"] += 1
-        self.counts["bare_m"] += round(survey.bare_m)
+        self.counts["bare_m"] += round(survey.off.bare_m)
 
     # --- parts -----------------------------------------------------------------------------------------------------
 

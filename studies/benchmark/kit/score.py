@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ CHANGES: Final = ("new", "modified", "deleted")
 LEVELS: Final = ("observable", "all", "scored")
 MERGED: Final = "merged"
 
+_FARTHEST: Final = 1e7
+"""No voxel or point of a world has a larger coordinate, metres or voxels."""
 _A_M, _F, _LON_TILES = 6378137.0, 1.0 / 298.257223563, 1 << 20  # WGS-84; tiles along the equator
 
 
@@ -119,9 +122,9 @@ class ScoredWorld:
         try:
             frame = VoxelFrame.read(world / "frame.json")
             gaussians = np.loadtxt(world / "map_before" / "gaussians.csv", delimiter=",", skiprows=1, ndmin=2)
-            with np.load(truth, allow_pickle=False) as columns:
+            with truth.open("rb") as file, np.load(file, allow_pickle=False) as columns:
                 data = dict(columns)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise SubmissionError(f"world {name} of {folder} cannot be read: {error}") from error
         keys = frame.keys_of(data["ijk"].astype(np.int64))
         order = np.argsort(keys)
@@ -182,14 +185,14 @@ def read_submission(path: Path, worlds: Mapping[str, ScoredWorld]) -> Reported:
 
 def _rows(path: Path) -> Iterator[_Row]:
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8-sig", newline="") as file:
             if path.suffix == ".csv":
                 yield from (_row(path, line, one) for line, one in enumerate(csv.DictReader(file), 2))
             elif path.suffix == ".jsonl":
                 yield from (_row(path, line, json.loads(text)) for line, text in enumerate(file, 1) if text.strip())
             else:
                 raise SubmissionError(f"{path}: a submission is a .csv or a .jsonl file")
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error, RecursionError) as error:  # no UTF-8, no JSON, numbers of 5,000 digits
         raise SubmissionError(f"{path} cannot be read: {error}") from error
 
 
@@ -205,10 +208,10 @@ def _row(path: Path, line: int, found: Any) -> _Row:
         raise SubmissionError(f"{where}: class {found['class']!r}; it is one of {', '.join(CHANGES)}")
     try:
         x, y, z = (float(found[name]) for name in names)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise SubmissionError(f"{where}: {error}") from error
-    if not all(map(math.isfinite, (x, y, z))):
-        raise SubmissionError(f"{where}: {', '.join(names)} = {x}, {y}, {z}: finite numbers are needed")
+    if not all(abs(number) < _FARTHEST for number in (x, y, z)):  # nor is NaN
+        raise SubmissionError(f"{where}: {', '.join(names)} = {x}, {y}, {z}: numbers below {_FARTHEST:g} are needed")
     if names[0] == "i" and not all(number.is_integer() for number in (x, y, z)):
         raise SubmissionError(f"{where}: i, j, k = {x}, {y}, {z}: integers are needed")
     who = found.get("vehicle") or MERGED
@@ -342,7 +345,7 @@ def read_worlds(folder: Path) -> dict[str, ScoredWorld]:
         found = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise SubmissionError(f"{folder} is no exported benchmark: {error}") from error
-    if (found.get("format"), found.get("version")) != (FORMAT, VERSION):
+    if not isinstance(found, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
         raise SubmissionError(f"{folder}/benchmark.json is not of format {FORMAT}, version {VERSION}")
     if not found.get("finished"):
         raise SubmissionError(f"the export into {folder} has not ended: start it again, it goes on where it was")

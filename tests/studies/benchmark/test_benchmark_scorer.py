@@ -121,7 +121,7 @@ def test_what_is_left_out_counts_as_no_change_and_is_named(made: Made, tmp_path:
         ("street-9,merged,1,1,1,new", "unknown world 'street-9'"),
         ("street-1,vehicle-07,1,1,1,new", "unknown vehicle 'vehicle-07'"),
         ("street-1,merged,1,1,1,normal", "class 'normal'"),
-        ("street-1,merged,1,nan,1,new", "finite numbers are needed"),
+        ("street-1,merged,1,nan,1,new", "numbers below 1e+07 are needed"),
         ("street-1,merged,1,1.5,1,new", "integers are needed"),
         ("street-1,merged,1,one,1,new", "could not convert string to float: 'one'"),
         ("street-1,merged,1,,1,new", "no j; world, class"),
@@ -144,6 +144,36 @@ def test_it_refuses_with_the_line(made: Made, tmp_path: Path, row: str, what: st
     assert what in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"world": "street-1", "class": "new", "i": 1' + 400 * "0" + ', "j": 1, "k": 1}',
+        '{"world": "street-1", "class": "new", "i": ' + 5000 * "1" + ', "j": 1, "k": 1}',
+        '{"world": "street-1", "class": "new", "x": 1e300, "y": 1, "z": 1}',
+        '{"world": "street-1", "class": "new", "x": [1], "y": 1, "z": 1}',
+        '{"world": ["street-1"], "class": ["new"], "x": 1, "y": 1, "z": 1}',
+        '{"world": "street-1", "class": "new", "i": 1e18, "j": 1, "k": 1}',
+        100_000 * "[",
+        '["street-1", "merged"]',
+        "null",
+        "{",
+        "\x00",
+        "\ud800",
+    ],
+)
+def test_hostile_lines_are_refused(made: Made, tmp_path: Path, line: str) -> None:
+    path = tmp_path / "bad.jsonl"
+    path.write_bytes(line.encode("utf-8", "surrogatepass") + b"\n")
+    with pytest.raises(kit.SubmissionError, match=r"bad\.jsonl"):
+        scores_of(made[0], path)
+
+
+def test_a_mark_of_utf_8_before_the_head_is_no_column(made: Made, tmp_path: Path) -> None:
+    """Spreadsheets write one."""
+    (tmp_path / "marked.csv").write_text("\ufeffworld,vehicle,i,j,k,class\n", encoding="utf-8")
+    assert kit.read_submission(tmp_path / "marked.csv", kit.read_worlds(made[0])) == {}
+
+
 def test_points_of_one_voxel_may_not_contradict_each_other(made: Made, tmp_path: Path) -> None:
     frame = IndexFrame.around(made[1]["street-1"])
     x, y, z = frame.grid.map_of_grid(frame.first[None] + 0.5)[0]
@@ -155,9 +185,11 @@ def test_points_of_one_voxel_may_not_contradict_each_other(made: Made, tmp_path:
 @pytest.mark.parametrize("damage", ["benchmark.json", "worlds/street-1/frame.json", "truth/suburb-2/voxels.npz"])
 def test_a_damaged_folder_is_named(made: Made, tmp_path: Path, damage: str) -> None:
     folder = write_export(tmp_path / "own", made[1])
-    (folder / damage).write_bytes(b"{")
-    with pytest.raises(kit.SubmissionError, match=r"own"):
-        kit.read_worlds(folder)
+    whole = (folder / damage).read_bytes()
+    for torn in (b"{", b"[]", whole[: len(whole) // 2]):
+        (folder / damage).write_bytes(torn)
+        with pytest.raises(kit.SubmissionError, match=r"own"):
+            kit.read_worlds(folder)
 
 
 def test_its_voxels_are_those_of_the_map() -> None:

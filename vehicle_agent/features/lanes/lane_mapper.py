@@ -285,7 +285,7 @@ class LaneMapper:
                 off.append(_to_left(one, min(near, key=abs)))
         if len(off) < _LEAST_MATCHED:
             return False
-        claimed = float(np.hypot(np.median([one.sigma_m for one in drawn]), 0.0))
+        claimed = float(np.median([one.sigma_m for one in drawn]))
         common = float(np.median(off))
         self.counts["common_shift_mm"] = round(1e3 * common)
         return abs(common) > max(_DOUBT_M, _DOUBT_SIGMAS * claimed)
