@@ -33,6 +33,7 @@ from gnd.fleet_sim.dense_scan import DenseScan, ScanPlan
 from gnd.fleet_sim.errors import TruthError
 from gnd.fleet_sim.world import STATES, World, to_json
 from gnd.gnd_map.accumulate import N_MIN_CELLS
+from gnd.gnd_map.bounded import json_value
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.geodesy import LocalFrame
@@ -272,7 +273,7 @@ def read_truth(path: Path) -> Truth:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             data = dict(file)
-        head = json.loads(str(data["head"]))
+        head = json_value(str(data["head"]))
         if (head.get("format"), head.get("version")) != (_FORMAT, _VERSION):
             raise TruthError(f"{path} is no truth file of version {_VERSION}")
         if head["rules"] != json.loads(json.dumps(asdict(TruthRules()))):

@@ -7,6 +7,7 @@ degrees for positions, a point cloud in the frame `lidar`, quaternions x, y, z, 
 import math
 from collections.abc import Mapping
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -132,6 +133,9 @@ def _dtype_of(layout: _Layout, stride: int) -> np.dtype[np.void]:
     if unknown:
         raise BadValue(f"point field {unknown[0]!r} has an unknown numeric type")
     names, offsets, kinds = zip(*layout, strict=True) if layout else ((), (), ())
+    spans = sorted((offset, offset + np.dtype(_NUMERIC[kind]).itemsize) for _, offset, kind in layout)
+    if any(end > start for (_, end), (start, _) in pairwise(spans)):
+        raise BadValue(f"point fields {', '.join(names)} at bytes {list(offsets)} overlap")
     with refusing(f"points of {stride} bytes with fields {', '.join(names) or 'none'}"):
         formats = [_NUMERIC[kind] for kind in kinds]
         return np.dtype({"names": list(names), "offsets": list(offsets), "formats": formats, "itemsize": stride})

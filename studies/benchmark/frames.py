@@ -1,6 +1,5 @@
 """The voxels of a world as strangers index them: i, j, k from 0, in one map frame."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from gnd.fleet_sim.truth import Truth, grid_of
 from gnd.gnd_map.arrays import I64
+from gnd.gnd_map.bounded import json_value
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile_id import TileId
@@ -49,7 +49,7 @@ class IndexFrame:
             BenchmarkError: the file is missing or damaged.
         """
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            found = json_value(path.read_text(encoding="utf-8"))
             frame = LocalFrame(found["lat_rad"], found["lon_rad"], found["height_m"])
             grid = GridFrame.around(frame, [TileId.from_geodetic(frame.lat_rad, frame.lon_rad)])
             first, size = (np.array(found[name], np.int64) for name in ("first", "size"))
