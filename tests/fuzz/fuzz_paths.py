@@ -7,7 +7,7 @@ from typing import Final
 HERE: Final = Path(__file__).resolve().parent
 ROOT: Final = HERE.parents[1]
 CORPUS: Final = HERE / "corpus"
-_LENDERS: Final = ("schemas", "gnd_map", "survey", "tile_store", "importer", "studies/benchmark")
+_LENDERS: Final = ("schemas", "gnd_map", "survey", "tile_store", "importer", "studies/benchmark", "feature_io")
 
 
 def add_paths() -> None:

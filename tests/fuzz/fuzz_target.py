@@ -40,7 +40,7 @@ class FuzzTarget:
     seeds: Seeds
     mutate: Mutate
     refuses: tuple[type[BaseException], ...] = (GndError,)
-    rounds: int = 200
+    rounds: int = 40
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,7 @@ def _zstd_text(data: bytes, rng: Random) -> bytes:
     if kind == 0:
         return bytes_mutated(data, rng)
     if kind == 1:
-        return zstandard.ZstdCompressor().compress(bytes(1 << 29)) if rng.randrange(50) == 0 else b""
+        return zstandard.ZstdCompressor().compress(bytes(1 << 28)) if rng.randrange(50) == 0 else b""
     try:
         plain = zstandard.ZstdDecompressor().decompress(data, max_output_size=1 << 20)
     except zstandard.ZstdError:
@@ -146,7 +146,7 @@ def _zlib_text(data: bytes, rng: Random) -> bytes:
     except zlib.error:
         return bytes_mutated(data, rng)
     if rng.randrange(400) == 0:
-        plain = b" " * (1 << 29)
+        plain = b" " * (1 << 28)
     return zlib.compress(text_mutated(plain, rng), 1) if rng.randrange(8) else bytes_mutated(data, rng)
 
 

@@ -4,6 +4,7 @@ import io
 import json
 import struct
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -68,8 +69,9 @@ def _drive() -> bytes:
     header = DriveHeader("drive-1", "car-1", "VLP-16", LocalFrame(0.855, 0.146, 110.0), np.eye(4), "made up")
     path = folder("seeds") / "drive.mcap"
     with DriveWriter(path, header) as writer:
-        for data in _items():
-            writer.add(item_of(ITEM_TOPICS[data[0]], data[1:]))
+        for item in (item_of(ITEM_TOPICS[data[0]], data[1:]) for data in _items()):
+            writer.add(item)
+            writer.add(replace(item, t_ns=item.t_ns + 100_000_000))
     return path.read_bytes()
 
 
@@ -303,7 +305,7 @@ def _xz(data: bytes, rng: Random) -> bytes:
     import lzma
 
     if rng.randrange(300) == 0:
-        return lzma.compress(bytes(1 << 29), preset=0)
+        return lzma.compress(bytes(1 << 28), preset=0)
     return bytes_mutated(data, rng)
 
 
@@ -330,7 +332,8 @@ TARGETS = (
     _recording_target("pcd-folder", (f"{_IMPORTERS}/pcd.py:open_pcd",), "a folder of PCD files: its poses", "pcd",
                       _pcd_folder, "scans/poses.txt", text_mutated),
     FuzzTarget("las", (f"{_IMPORTERS}/las.py:open_las",), "LAS files",
-               in_recording("las", _las_files("las"), "1.las", opened("las")), lambda: [_las()], bytes_mutated, rounds=40),
+               in_recording("las", _las_files("las"), "1.las", opened("las")), lambda: [_las()], bytes_mutated,
+               rounds=40),
     FuzzTarget("laz", (), "LAZ files", in_recording("laz", _las_files("laz"), "1.laz", opened("las")),
                lambda: [_las(True)], bytes_mutated, rounds=40),
     FuzzTarget("xz", (f"{_IMPORTERS}/files.py:read_file",), "packed scans (xz)", on_file("a.bin.xz", read_file),

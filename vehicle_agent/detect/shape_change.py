@@ -179,7 +179,7 @@ class ShapeModel:
             low, high = (np.array(data[name], np.float64) for name in ("low", "high"))
             plain = PlainShapeRule(**data["plain"])
             return cls(forest_from(data), float(data["limit"]), float(data["alike"]), low, high, plain)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise ShapeModelError(f"the file of the fitted trees is damaged: {error}") from error
 
 
