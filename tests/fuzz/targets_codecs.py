@@ -14,6 +14,7 @@ from fuzz_target import FuzzTarget
 
 from gnd.cloud_merger.features.memory import LayerMemory, Own, PlaceEstimate, Remembered, Vote
 from gnd.cloud_merger.memory import PARKED, STATEMENT, VOXEL, TileMemory, Witness
+from gnd.gnd_map.bounded import inflated, zstd_unpacked
 from gnd.gnd_map.codec import (
     REPORT,
     Flags,
@@ -134,16 +135,16 @@ def _zstd_text(data: bytes, rng: Random) -> bytes:
     if kind == 1:
         return zstandard.ZstdCompressor().compress(bytes(1 << 28)) if rng.randrange(50) == 0 else b""
     try:
-        plain = zstandard.ZstdDecompressor().decompress(data, max_output_size=1 << 20)
-    except zstandard.ZstdError:
+        plain = zstd_unpacked(data, 1 << 20)
+    except ValueError:
         return bytes_mutated(data, rng)
     return zstandard.ZstdCompressor(level=1).compress(text_mutated(plain, rng))
 
 
 def _zlib_text(data: bytes, rng: Random) -> bytes:
     try:
-        plain = zlib.decompress(data)
-    except zlib.error:
+        plain = inflated(data, 1 << 20)
+    except ValueError:
         return bytes_mutated(data, rng)
     if rng.randrange(400) == 0:
         plain = b" " * (1 << 28)
