@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fuzz_all import TARGETS
 from fuzz_paths import ROOT
+from fuzz_table import PAGE, table
 
 FOLDERS = (
     "gnd_map", "schemas", "fleet_bus", "tile_client", "tile_store", "vehicle_agent", "cloud_merger", "fleet_sim",
@@ -127,3 +128,7 @@ def test_a_new_decoder_would_be_missed() -> None:
     assert NAMED_LIKE_ONE.match("read_new_file")
     assert not NAMED_LIKE_ONE.match("reading_room_of")
     assert len(named_like_decoders()) > 120
+
+
+def test_the_page_lists_the_targets() -> None:
+    assert table() in PAGE.read_text(encoding="utf-8"), "run: python tests/fuzz/fuzz_table.py"
