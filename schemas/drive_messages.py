@@ -133,9 +133,6 @@ def _dtype_of(layout: _Layout, stride: int) -> np.dtype[np.void]:
     if unknown:
         raise BadValue(f"point field {unknown[0]!r} has an unknown numeric type")
     names, offsets, kinds = zip(*layout, strict=True) if layout else ((), (), ())
-    spans = sorted((offset, offset + np.dtype(_NUMERIC[kind]).itemsize) for _, offset, kind in layout)
-    if any(end > start for (_, end), (start, _) in pairwise(spans)):
-        raise BadValue(f"point fields {', '.join(names)} at bytes {list(offsets)} overlap")
     with refusing(f"points of {stride} bytes with fields {', '.join(names) or 'none'}"):
         formats = [_NUMERIC[kind] for kind in kinds]
         return np.dtype({"names": list(names), "offsets": list(offsets), "formats": formats, "itemsize": stride})
@@ -146,6 +143,10 @@ def _check_cloud(cloud: PointCloud, dtype: np.dtype[np.void], size: int) -> None
     if missing:
         raise BadValue(f"points lack {', '.join(sorted(missing))}; deskewing needs the time of each point")
     _check_types(dtype)
+    fields = dtype.fields or {}
+    spans = sorted((field[1], field[1] + field[0].itemsize) for field in fields.values())
+    if any(end > start for (_, end), (start, _) in pairwise(spans)):
+        raise BadValue(f"point fields {', '.join(fields)} at bytes {[start for start, _ in spans]} overlap")
     if size % dtype.itemsize:
         raise BadValue(f"{size} bytes of points are no multiple of the {dtype.itemsize} bytes of a point")
     check_length("point cloud", size // dtype.itemsize, limits.MAX_POINTS_OF_SCAN, "points")

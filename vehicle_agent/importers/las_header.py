@@ -27,13 +27,13 @@ def check_las(path: Path) -> None:
     except OSError as error:
         raise ImportDriveError(f"{path}: cannot be read: {error.strerror or error}") from error
     if data[:4] != b"LASF" or len(data) < _SHORTEST:
-        raise ImportDriveError(f"{path}: {len(data)} bytes, no LAS file")
+        raise ImportDriveError(f"{path}: no readable LAS: {len(data)} bytes")
     header, first, records, form, length, points = _FIELDS.unpack_from(data, 94)
     if data[25] >= 4 and len(data) >= _WITH_LONG_COUNT:
         points = max(points, struct.unpack_from("<Q", data, 247)[0])
         _check_extended(path, data)
     if not header <= first <= len(data) or records * _VLR_BYTES > first:
-        raise ImportDriveError(f"{path}: {records} records, points from byte {first} of {len(data)}")
+        raise ImportDriveError(f"{path}: no readable LAS: {records} records, points from byte {first} of {len(data)}")
     if points > MAX_POINTS or points * length > MAX_BYTES:
         raise ImportDriveError(
             f"{path}: {points} points of {length} bytes; a sweep has at most {MAX_POINTS} and {MAX_BYTES} bytes"
@@ -41,23 +41,25 @@ def check_las(path: Path) -> None:
     if form & _COMPRESSED:
         _check_chunks(path, data, first, points)
     elif first + points * length > len(data):
-        raise ImportDriveError(f"{path}: {len(data)} bytes, {points} points of {length} bytes announced")
+        raise ImportDriveError(
+            f"{path}: no readable LAS: {len(data)} bytes, {points} points of {length} bytes announced"
+        )
 
 
 def _check_extended(path: Path, data: bytes) -> None:
     start, records = struct.unpack_from("<QI", data, 235)
     if records and not 0 < start <= len(data) - 60 * min(records, len(data)):
-        raise ImportDriveError(f"{path}: {records} extended records from byte {start} of {len(data)}")
+        raise ImportDriveError(f"{path}: no readable LAS: {records} extended records from byte {start} of {len(data)}")
 
 
 def _check_chunks(path: Path, data: bytes, first: int, points: int) -> None:
     if first + 8 > len(data):
-        raise ImportDriveError(f"{path}: cut off before its points")
+        raise ImportDriveError(f"{path}: no readable LAS: cut off before its points")
     at = struct.unpack_from("<q", data, first)[0]
     if at == -1:  # written without going back: the last eight bytes say it
         at = struct.unpack_from("<q", data, len(data) - 8)[0]
     if not first + 8 <= at <= len(data) - 8:
-        raise ImportDriveError(f"{path}: table of chunks at byte {at} of {len(data)}")
+        raise ImportDriveError(f"{path}: no readable LAS: table of chunks at byte {at} of {len(data)}")
     chunks = struct.unpack_from("<I", data, at + 4)[0]
     if chunks > points:
-        raise ImportDriveError(f"{path}: {chunks} chunks of {points} points")
+        raise ImportDriveError(f"{path}: no readable LAS: {chunks} chunks of {points} points")

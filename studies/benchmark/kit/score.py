@@ -217,7 +217,7 @@ def _row(path: Path, line: int, found: Any) -> _Row:
     except (TypeError, ValueError, OverflowError) as error:
         raise SubmissionError(f"{where}: {error}") from error
     if not all(abs(number) <= MOST for number in (x, y, z)):  # NaN fails, too
-        raise SubmissionError(f"{where}: {', '.join(names)} = {x}, {y}, {z}: finite numbers to {MOST:g} are needed")
+        raise SubmissionError(f"{where}: {', '.join(names)} = {x}, {y}, {z}: finite numbers are needed, up to {MOST:g}")
     if names[0] == "i" and not all(number.is_integer() for number in (x, y, z)):
         raise SubmissionError(f"{where}: i, j, k = {x}, {y}, {z}: integers are needed")
     who = found.get("vehicle") or MERGED
