@@ -49,6 +49,7 @@ from gnd.cloud_merger.shift import (
     SHIFT_MAX_RAD,
     SHIFT_REFUTED_SHARE,
 )
+from gnd.gnd_map.bounded import json_value
 from gnd.gnd_map.config import from_mapping, to_mapping
 from gnd.gnd_map.errors import ConfigError
 from gnd.gnd_map.foliage import BOUNDS as SEASON_BOUNDS
@@ -136,7 +137,7 @@ def with_text(config: ShardConfig, text: str) -> ShardConfig:
     if not text:
         return config
     try:
-        said = json.loads(text)
+        said = json_value(text)
         if said["format"] != _FORMAT:
             raise MergerError(f"parameters of format {said['format']}, this release reads {_FORMAT}")
         said["confirmation"].setdefault("parked_h", 0.0)  # made when nothing was held back for its shape

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, Rows, Witness, find, stacked, states_at
+from gnd.gnd_map.bounded import json_value, zstd_unpacked
 from gnd.gnd_map.gaussian import Gaussians
 
 I32 = NDArray[np.int32]
@@ -42,6 +43,8 @@ MOST_OBSERVERS: Final = 255
 _FORMAT: Final = 2
 """1: without parked things."""
 _LEVEL: Final = 3
+_MAX_BYTES: Final = 1 << 27
+"""Unpacked: a tile's 200,000 voxels with eight claims each need as much."""
 _NS_PER_S: Final = 1_000_000_000
 
 # One remembered voxel. `observers`: vehicles that confirmed its state, counted up to 255; `last`: 16 bits of the hash
@@ -154,9 +157,9 @@ class TileMemory:
             MergerError: it is damaged or of another format.
         """
         try:
-            data = zstandard.ZstdDecompressor().decompress(body)
+            data = zstd_unpacked(body, _MAX_BYTES)
             at = 4 + int.from_bytes(data[:4], "little")
-            head = json.loads(data[4:at])
+            head = json_value(data[4:at])
             if head["format"] not in (1, _FORMAT):
                 raise MergerError(f"a memory of format {head['format']}, this release reads 1 to {_FORMAT}")
             n, rest = head["voxels"], memoryview(data)[at:]
@@ -170,7 +173,7 @@ class TileMemory:
             claims = np.frombuffer(rest[first:], STATEMENT, head["claims"]).copy()
             parked = np.frombuffer(rest[first + claims.nbytes :], PARKED, head.get("parked", 0)).copy()
             return cls(voxels, claims, tuple(Witness(**one) for one in head["witnesses"]), head["voters"], parked)
-        except (ValueError, KeyError, TypeError, zstandard.ZstdError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
 
 

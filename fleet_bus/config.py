@@ -88,7 +88,7 @@ def check_endpoint(endpoint: str) -> None:
     """
     protocol, slash, address = endpoint.partition("/")
     host, _, port = address.partition("#")[0].rpartition(":")
-    if not (slash and protocol and host and port.isdigit() and int(port) < 65_536):
+    if not (slash and protocol and host and port.isdecimal() and len(port) <= 5 and int(port) < 65_536):
         raise BusConfigError(f"endpoint {endpoint!r} is not like {DEFAULT_ENDPOINT}")
 
 

@@ -1,12 +1,12 @@
 """Profiles of mobile links: what a vehicle's connection can carry, and the session settings that suit it."""
 
 import math
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from gnd.fleet_bus.errors import LinkError
+from gnd.gnd_map.bounded import toml_table
 from gnd.gnd_map.config import from_mapping
 from gnd.gnd_map.errors import ConfigError
 
@@ -126,8 +126,8 @@ def read_links(path: Path) -> dict[str, LinkProfile]:
         LinkError: the file cannot be read, or a profile is malformed.
     """
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        tables = toml_table(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise LinkError(f"cannot read link profiles from {path}: {error}") from error
     return {name: _profile(name, table) for name, table in tables.items()}
 

@@ -5,14 +5,18 @@ three values alone, 33 bytes; those before have the name of each in front of it.
 Source: rmw_zenoh_cpp/src/detail/attachment_helpers.cpp, docs/design.md.
 """
 
+import struct
 from dataclasses import dataclass
 from typing import Final
 
-import zenoh
 from zenoh import ext
 
 GID_BYTES: Final = 16
 _NAMES: Final = ("sequence_number", "source_timestamp", "source_gid")
+_TOLD: Final = tuple(bytes([len(name)]) + name.encode() for name in _NAMES)
+"""As zenoh writes texts: their length, then themselves."""
+_PLAIN: Final = struct.Struct("<qqB16s")
+_NAMED: Final = struct.Struct(f"<{len(_TOLD[0])}sq{len(_TOLD[1])}sq{len(_TOLD[2])}sB16s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +45,16 @@ class RosAttachment:
 
     @classmethod
     def decode(cls, data: bytes) -> "RosAttachment | None":
-        """Read either layout; None where it is neither."""
-        packed = zenoh.ZBytes(data)
-        has_names = data[1:].startswith(_NAMES[0].encode())
-        try:
-            if has_names:
-                read = ext.z_deserialize(tuple[str, ext.Int64, str, ext.Int64, str, bytes], packed)
-                sequence, sent_ns, gid = read[1], read[3], read[5]
-            else:
-                sequence, sent_ns, gid = ext.z_deserialize(tuple[ext.Int64, ext.Int64, bytes], packed)
-        except ext.ZDeserializeError:
+        """Read either layout; None where it is neither.
+
+        Not with zenoh's deserialiser: it makes room for any length that is told before it looks whether so many bytes
+        are there, and ends the process where there is no such room.
+        """
+        if len(data) == _PLAIN.size:
+            sequence, sent_ns, n, gid = _PLAIN.unpack(data)
+            return cls(sequence, sent_ns, gid) if n == GID_BYTES else None
+        if len(data) != _NAMED.size:
             return None
-        return cls(int(sequence), int(sent_ns), bytes(gid), has_names) if len(gid) == GID_BYTES else None
+        first, sequence, second, sent_ns, third, n, gid = _NAMED.unpack(data)
+        known = (first, second, third) == _TOLD and n == GID_BYTES
+        return cls(sequence, sent_ns, gid, has_names=True) if known else None

@@ -5,11 +5,11 @@ of the command.
 """
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from gnd.gnd_map.bounded import toml_table
 from gnd.gnd_map.errors import ConfigError
 from gnd.gnd_map.settings import from_settings, merged, of_changes, of_environment, settings_sha256, settings_text
 
@@ -25,10 +25,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         ConfigError: it cannot be read, or is no TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return toml_table(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigError(f"{path} is no valid TOML: {error}") from error
 
 

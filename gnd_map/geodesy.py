@@ -7,7 +7,7 @@ tests.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +73,10 @@ def geodetic_from_ecef(p_ecef_m: npt.ArrayLike) -> tuple[F64, F64, F64]:
     return lat, np.arctan2(y, x), height
 
 
+MAX_LON_RAD: Final = 1e6
+"""Longitudes wrap, but not so often: the indices of tiles stay integers."""
+
+
 def check_geodetic(lat_rad: npt.ArrayLike, lon_rad: npt.ArrayLike) -> None:
     """Refuse latitudes beyond a pole and values that are not finite.
 
@@ -84,6 +88,8 @@ def check_geodetic(lat_rad: npt.ArrayLike, lon_rad: npt.ArrayLike) -> None:
         raise GeodesyError("latitude or longitude is not finite")
     if lat.size and float(np.abs(lat).max()) > np.pi / 2:
         raise GeodesyError(f"latitude {float(np.abs(lat).max())} rad lies beyond a pole; are these degrees?")
+    if lon.size and float(np.abs(lon).max()) > MAX_LON_RAD:
+        raise GeodesyError(f"longitude {float(np.abs(lon).max())} rad is beyond {MAX_LON_RAD:g}")
 
 
 def enu_axes(lat_rad: npt.ArrayLike, lon_rad: npt.ArrayLike) -> F64:

@@ -17,12 +17,13 @@ def R_from_quaternion_xyzw(q: npt.ArrayLike) -> F64:
     """(..., 3, 3) rotations of quaternions (..., 4); they are normalised first.
 
     Raises:
-        ShapeError: a quaternion has no length.
+        ShapeError: a quaternion has no length, or none that is finite.
     """
     quaternion = np.asarray(q, dtype=np.float64)
-    length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    if quaternion.shape[-1:] != (4,) or not (length > 0.0).all():
-        raise ShapeError(f"quaternions: expected (..., 4) of length > 0, got shape {quaternion.shape}")
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    if quaternion.shape[-1:] != (4,) or not ((length > 0.0) & (length < np.inf)).all():
+        raise ShapeError(f"quaternions: expected (..., 4) of finite length > 0, got shape {quaternion.shape}")
     x, y, z, w = np.moveaxis(quaternion / length, -1, 0)
     rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],

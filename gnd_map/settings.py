@@ -13,6 +13,7 @@ from difflib import get_close_matches
 from hashlib import sha256
 from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from gnd.gnd_map.bounded import json_value
 from gnd.gnd_map.config import from_mapping, to_mapping
 from gnd.gnd_map.errors import ConfigError
 
@@ -324,7 +325,7 @@ def _refuse_unknown_path(cls: type[Any], keys: Sequence[str], origin: str) -> No
 
 def _value(text: str) -> Any:
     try:
-        return json.loads(text)
+        return json_value(text)
     except ValueError:
         return text
 

@@ -53,8 +53,9 @@ def check_rigid(name: str, T: F64) -> None:
     """`BadValue` unless `T` is a (4, 4) float64 rigid transform: right-handed rotation, last row 0 0 0 1."""
     with refusing(name):
         check_array(name, T, np.float64, (4, 4))
-    off = max(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max(), np.abs(T[3] - [0, 0, 0, 1]).max())
-    if off > _RIGID_TOLERANCE or np.linalg.det(T[:3, :3]) < 0:
+    R = np.clip(T[:3, :3], -2.0, 2.0)  # products of huge numbers overflow
+    off = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0, 0, 0, 1]).max())
+    if off > _RIGID_TOLERANCE or np.linalg.det(R) < 0:
         raise BadValue(f"{name} is not a rigid transform: off by {off:.3g}, tolerance {_RIGID_TOLERANCE}")
 
 

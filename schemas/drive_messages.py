@@ -7,6 +7,7 @@ degrees for positions, a point cloud in the frame `lidar`, quaternions x, y, z, 
 import math
 from collections.abc import Mapping
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -142,6 +143,10 @@ def _check_cloud(cloud: PointCloud, dtype: np.dtype[np.void], size: int) -> None
     if missing:
         raise BadValue(f"points lack {', '.join(sorted(missing))}; deskewing needs the time of each point")
     _check_types(dtype)
+    fields = dtype.fields or {}
+    spans = sorted((field[1], field[1] + field[0].itemsize) for field in fields.values())
+    if any(end > start for (_, end), (start, _) in pairwise(spans)):
+        raise BadValue(f"point fields {', '.join(fields)} at bytes {[start for start, _ in spans]} overlap")
     if size % dtype.itemsize:
         raise BadValue(f"{size} bytes of points are no multiple of the {dtype.itemsize} bytes of a point")
     check_length("point cloud", size // dtype.itemsize, limits.MAX_POINTS_OF_SCAN, "points")

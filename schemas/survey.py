@@ -302,7 +302,10 @@ def _motion_of(what: str, motion: Iterable[float], covariance: Iterable[float]) 
     moved, upper = np.array(list(motion), np.float64), np.array(list(covariance), np.float64)
     if moved.shape != (6,) or upper.shape != (21,):
         raise BadValue(f"{what}: {len(moved)} numbers of a pose and {len(upper)} of its covariance, need 6 and 21")
-    if not (np.isfinite(moved).all() and np.isfinite(upper).all() and np.linalg.norm(moved[:3]) <= np.pi + 1e-6):
+    small = np.abs(moved[:3]).max() <= np.pi + 1e-6  # first: the square of a huge number overflows; NaN fails, too
+    if not (small and np.isfinite(moved).all() and np.isfinite(upper).all()) or (
+        np.linalg.norm(moved[:3]) > np.pi + 1e-6
+    ):
         raise BadValue(f"{what}: a pose or covariance that is not finite, or a turn of more than half a circle")
     full = np.zeros((6, 6))
     full[_UPPER] = upper

@@ -29,6 +29,7 @@ _TIME: Final = re.compile(r"(\d{1,10})(?:\.(\d*))?")
 _UNIT_TOLERANCE: Final = 1e-3
 _ROTATION_TOLERANCE: Final = 1e-3
 """What other programs write has few digits; rotations are made orthonormal when they are read."""
+_MAX_NUMBER: Final = 1e15
 _ValueT = TypeVar("_ValueT")
 
 
@@ -204,8 +205,8 @@ def _number(word: str) -> float:
         value = float(word)
     except ValueError:
         raise TrajectoryError(f"{word[:40]!r} is no number") from None
-    if not np.isfinite(value):
-        raise TrajectoryError(f"{word[:40]!r} is not finite")
+    if not abs(value) <= _MAX_NUMBER:  # NaN fails, too
+        raise TrajectoryError(f"{word[:40]!r} is not finite, or beyond {_MAX_NUMBER:g}")
     return value
 
 

@@ -28,6 +28,7 @@ STEPS: Final = (
     (9, "schema_of_new_roads"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
+_TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks")
 
 
 def schema_of(connection: apsw.Connection, path: Path) -> int:
@@ -47,7 +48,25 @@ def schema_of(connection: apsw.Connection, path: Path) -> int:
         raise StoreUnavailable(
             f"{path}: store schema {version}, this release reads up to {SCHEMA_VERSION}; use the gnd that wrote it"
         )
-    return int(version) if application_id == APPLICATION_ID else 0
+    if application_id != APPLICATION_ID:
+        return 0
+    _check_makeup(connection, path)
+    return int(version)
+
+
+def _check_makeup(connection: apsw.Connection, path: Path) -> None:
+    """StoreUnavailable for what no release has made: a view can compute for ever, a trigger write what it likes, and
+    tables without types hold anything.
+    """
+    found: list[Any] = connection.execute(
+        "SELECT type, name FROM pragma_table_list WHERE schema = 'main' AND substr(name, 1, 7) <> 'sqlite_'"
+        " AND (type <> 'table' OR NOT strict)"
+        " UNION ALL SELECT type, name FROM sqlite_schema WHERE type = 'trigger'"
+    ).fetchall()
+    strange = [(kind, name) for kind, name in found if kind != "trigger" or name not in _TRIGGERS]
+    if strange:
+        kind, name = strange[0]
+        raise StoreUnavailable(f"{path}: not a tile store as any release has made one: {kind} {str(name)[:80]!r}")
 
 
 def migrate(connection: apsw.Connection, path: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from gnd.gnd_map.bounded import inflated, json_value
 from gnd.tile_store.errors import StoreError
 
 
@@ -30,6 +31,7 @@ class Provenance:
 
 
 NOTHING: Final = Provenance((), {})
+_MAX_BYTES: Final = 1 << 25
 
 
 def encode_provenance(provenance: Provenance) -> bytes:
@@ -44,7 +46,7 @@ def decode_provenance(data: bytes) -> Provenance:
     if not data:
         return NOTHING
     try:
-        report_ids, voxels = json.loads(zlib.decompress(data))
+        report_ids, voxels = json_value(inflated(data, _MAX_BYTES))
         return Provenance(tuple(report_ids), {voxel: tuple(indices) for voxel, indices in voxels})
-    except (zlib.error, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise StoreError(f"provenance of {len(data)} bytes is damaged: {error}") from None

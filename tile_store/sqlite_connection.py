@@ -24,6 +24,10 @@ OLDEST_SQLITE: Final = (3, 51, 3)
 """Older ones can corrupt a WAL that several connections write and checkpoint."""
 
 
+NO_ROW: Final = (TypeError, ValueError, KeyError, IndexError, ArithmeticError, AttributeError)
+"""What rows with values that nobody has written lead to."""
+
+
 T = TypeVar("T")
 Row = tuple[Any, ...]
 Bindings = Mapping[str, Any]
@@ -129,6 +133,7 @@ def _opened_reader(name: str, path: Path, flags: int) -> apsw.Connection:
     connection = apsw.Connection(name, flags=apsw.SQLITE_OPEN_READONLY | flags)
     try:
         connection.set_busy_handler(_Patience(READER_PATIENCE_S))
+        connection.pragma("trusted_schema", False)
         schema_of(connection, path)
     except BaseException:
         connection.close()
@@ -207,6 +212,12 @@ class ReaderPool:
         except apsw.Error as error:
             connection.close()
             raise as_store_error(error, self._path) from None
+        except NO_ROW as error:
+            connection.close()
+            reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+            raise StoreDamaged(
+                f"{self._path}: holds a row that no store has ({reason}); see `gnd map check`"
+            ) from error
         except BaseException:
             connection.close()
             raise

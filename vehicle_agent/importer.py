@@ -11,6 +11,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -19,14 +20,15 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, log_so3
-from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, StandIn
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan, StandIn
 from gnd.schemas.drive_mcap import DriveWriter
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.apollo import open_apollo
 from gnd.vehicle_agent.importers.argoverse_logs import open_argoverse
 from gnd.vehicle_agent.importers.bins import open_bins
 from gnd.vehicle_agent.importers.choices import Choices
-from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
+from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, RawScan, cleaned
+from gnd.vehicle_agent.importers.damage import named_damage
 from gnd.vehicle_agent.importers.deskewing import with_times
 from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.fitting import fit_heading_and_position as fit_heading_and_position
@@ -205,6 +207,16 @@ def open_recording(
     """A recording of a known format, or of the one that it is found to be of; ImportDriveError when it is none."""
     if kind not in (*FORMATS, AUTO):
         raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)} and {AUTO}")
+    with named_damage(folder):
+        return _opened(kind, folder, anchor, topic, choices)
+
+
+def _read_named(read: Callable[[int], RawScan | Scan], folder: Path, number: int) -> RawScan | Scan:
+    with named_damage(folder):
+        return read(number)
+
+
+def _opened(kind: str, folder: Path, anchor: RecordingAnchor | None, topic: str | None, choices: Choices) -> Recording:
     found = format_of(folder) if kind == AUTO else kind
     choices = replace(choices, anchor=anchor or choices.anchor, topic=topic or choices.topic)
     if found == "mcap" and is_foxglove_or_own(folder):
@@ -213,6 +225,7 @@ def open_recording(
         recording = CHOOSING.get(found, open_ros)(folder, choices.anchor, choices)
     else:
         recording = FORMATS[found](folder, choices.anchor)
+    recording = replace(recording, read=partial(_read_named, recording.read, folder))
     return as_chosen(_with_entries(recording, found, folder), folder, choices)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from gnd.gnd_map.bounded import json_value
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.errors import VehicleError
@@ -88,10 +89,13 @@ def read_way(path: Path) -> Iterator[Milestone]:
         VehicleError: a line is none of a way's.
     """
     found: list[Milestone] = []
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+    try:
+        lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+    except (OSError, UnicodeDecodeError) as error:
+        raise VehicleError(f"cannot read the way {path}: {error}") from error
     for line in lines:
         try:
-            one = Milestone(**json.loads(line))
+            one = Milestone(**json_value(line))
         except (ValueError, TypeError) as error:
             raise VehicleError(f"{path} holds a line that is no milestone: {line[:80]!r}") from error
         if found and one.odometer_m < found[-1].odometer_m:

@@ -18,10 +18,13 @@ from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.rls import PlaceEstimate
 from gnd.cloud_merger.features.statements import Attributes
 from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.bounded import json_value, zstd_unpacked
 from gnd.gnd_map.features import Existence, Feature
 
 _FORMAT: Final = 1
 _LEVEL: Final = 3
+_MAX_BYTES: Final = 1 << 25
+"""Unpacked: eight kilobytes for each of a tile's 4096 features."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,12 +177,12 @@ class LayerMemory:
             MergerError: it is damaged or of another format.
         """
         try:
-            row = json.loads(zstandard.ZstdDecompressor().decompress(body))
+            row = json_value(zstd_unpacked(body, _MAX_BYTES))
             if row["format"] != _FORMAT:
                 raise MergerError(f"a memory of layers of format {row['format']}, this release reads {_FORMAT}")
             features = [_feature(one) for one in row["features"]]
             return cls(tuple(_remembered(one, features) for one in row["tracks"]), tuple(row["witnesses"]))
-        except (ValueError, KeyError, TypeError, IndexError, zstandard.ZstdError) as error:
+        except (ValueError, KeyError, TypeError, IndexError) as error:
             raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
 
 

@@ -101,7 +101,7 @@ def parse_groups(text: str) -> tuple[Group, ...]:
 
 def _split(word: str) -> tuple[LinkProfile, int]:
     name, _, count = word.rpartition(":")
-    if not (name and count.isdigit() and int(count) > 0):
+    if not (name and count.isdecimal() and len(count) <= 6 and int(count) > 0):
         raise LabError(f"group {word!r} is not like 4g:2 (profile, colon, number of vehicles)")
     return load_link(name), int(count)
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F32
+from gnd.gnd_map.bounded import json_value
 from studies.benchmark.errors import BenchmarkError
 
 _CHUNK: Final = 1 << 20
@@ -77,7 +78,7 @@ def read_json(path: Path, make: Callable[[Any], Any] = dict) -> Any:
         BenchmarkError: the file is missing or damaged.
     """
     try:
-        return make(json.loads(path.read_text(encoding="utf-8")))
+        return make(json_value(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise BenchmarkError(f"cannot read {path}: {error}") from error
 

@@ -1,6 +1,5 @@
 """The voxels of a world as strangers index them: i, j, k from 0, in one map frame."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -10,13 +9,24 @@ from numpy.typing import NDArray
 
 from gnd.fleet_sim.truth import Truth, grid_of
 from gnd.gnd_map.arrays import I64
+from gnd.gnd_map.bounded import json_value
+from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile_id import TileId
 from studies.benchmark.errors import BenchmarkError
 
+_MOST: Final = 1e5
 _MARGIN: Final = 8
 """Voxels of room around those that the truth knows."""
+
+
+def _coordinate(value: Any) -> float:
+    """A latitude, longitude or height; ValueError, TypeError: it is none."""
+    number = float(value)
+    if not abs(number) < _MOST:  # NaN fails, too
+        raise ValueError(f"{number} is no coordinate")
+    return number
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +59,12 @@ class IndexFrame:
             BenchmarkError: the file is missing or damaged.
         """
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-            frame = LocalFrame(found["lat_rad"], found["lon_rad"], found["height_m"])
+            found = json_value(path.read_text(encoding="utf-8"))
+            frame = LocalFrame(*(_coordinate(found[name]) for name in ("lat_rad", "lon_rad", "height_m")))
             grid = GridFrame.around(frame, [TileId.from_geodetic(frame.lat_rad, frame.lon_rad)])
             first, size = (np.array(found[name], np.int64) for name in ("first", "size"))
             of_file = found["nx"], found["ny"]
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, GndError) as error:
             raise BenchmarkError(f"cannot read the frame {path}: {error}") from error
         if of_file != (grid.nx, grid.ny):
             raise BenchmarkError(f"{path} has tiles of {of_file} voxels, here they are {(grid.nx, grid.ny)}")

@@ -202,8 +202,11 @@ def read_poses(path: Path) -> list[ReferencePose]:
         BenchmarkError: it is missing or damaged.
     """
     try:
-        t_ns = np.loadtxt(path, np.int64, delimiter=",", skiprows=1, usecols=0, ndmin=1)
-        rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=range(1, 8), ndmin=2)
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines()[1:] if line.split("#")[0].strip()]
+        if not lines:
+            raise BenchmarkError(f"cannot read the poses {path}: there are none")
+        t_ns = np.loadtxt(lines, np.int64, delimiter=",", usecols=0, ndmin=1)
+        rows = np.loadtxt(lines, delimiter=",", usecols=range(1, 8), ndmin=2)
     except (OSError, ValueError) as error:
         raise BenchmarkError(f"cannot read the poses {path}: {error}") from error
     T = [T_from_R_t(R, t) for R, t in zip(R_from_quaternion_xyzw(rows[:, 3:]), rows[:, :3], strict=True)]

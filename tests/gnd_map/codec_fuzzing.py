@@ -55,12 +55,12 @@ class Decoder:
 
 def decoders() -> list[Decoder]:
     """All of them, with small messages."""
-    states = _states()
-    tiles = [_tile_decoder(codec_id, states) for codec_id in CODECS]
-    return [*tiles, _delta_decoder(states), _flags_decoder(states), _measured_decoder(states), *_lists()]
+    made = states()
+    tiles = [_tile_decoder(codec_id, made) for codec_id in CODECS]
+    return [*tiles, _delta_decoder(made), _flags_decoder(made), _measured_decoder(made), *_lists()]
 
 
-def _states() -> list[Gaussians]:
+def states() -> list[Gaussians]:
     """States of one tile: nothing, one voxel, some, the same later, many floors."""
     rng = np.random.default_rng(5)
     one = gaussians_of(ids_in(TILE, rng, 1), np.array([50]), np.zeros((1, 3)), np.diag([0.08, 0.08, 1e-4])[None])
@@ -121,12 +121,12 @@ def _flags_decoder(states: Sequence[Gaussians]) -> Decoder:
 
     rng, messages = np.random.default_rng(6), []
     for base in bases:
-        flags = [Flags(tile, b, *_flagged(b, tile, rng)) for tile, b in ((TILE, base), (other, states[1]))]
+        flags = [Flags(tile, b, *flagged(b, tile, rng)) for tile, b in ((TILE, base), (other, states[1]))]
         messages.append(encode_flags(flags))
     return Decoder("flags", decode, messages, resealed)
 
 
-def _flagged(base: Gaussians, tile_id: TileId, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def flagged(base: Gaussians, tile_id: TileId, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Some voxels of the base modified or deleted, some others new."""
     ids = np.union1d(base.voxel_id[rng.random(len(base)) < 0.4], ids_in(tile_id, rng, 4)).astype(np.int32)
     classes = np.where(np.isin(ids, base.voxel_id), rng.integers(2, 4, len(ids)), 1)

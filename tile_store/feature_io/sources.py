@@ -13,6 +13,7 @@ from typing import Any, Final
 import apsw
 import zstandard
 
+from gnd.gnd_map.bounded import json_value, zstd_unpacked
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.feature_io.errors import FeatureFileError
 from gnd.tile_store.feature_io.lane_network import MapLane, lane_of
@@ -69,10 +70,10 @@ def get_sources(c: apsw.Connection) -> list[FeatureSource]:
 
 def _source(name: str, about: str, body: bytes) -> FeatureSource:
     try:
-        told = json.loads(about)
-        document = zstandard.ZstdDecompressor().decompress(body, max_output_size=MAX_DOCUMENT_BYTES)
+        told = json_value(about)
+        document = zstd_unpacked(body, MAX_DOCUMENT_BYTES)
         ids = {layer: tuple(map(int, numbers)) for layer, numbers in told["ids"].items()}
         lanes = tuple(map(lane_of, told.get("lanes", ())))
         return FeatureSource(name, told["format"], ids, told["options"], document, lanes)
-    except (FeatureFileError, ValueError, KeyError, TypeError, AttributeError, zstandard.ZstdError) as error:
+    except (FeatureFileError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"source {name!r:.80} of the store is damaged: {type(error).__name__}: {error}") from None

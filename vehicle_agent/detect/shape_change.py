@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I32, check_array
+from gnd.gnd_map.bounded import json_value
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.similarity import similarity
@@ -172,13 +173,13 @@ class ShapeModel:
             ShapeModelError: the text is no model of these features.
         """
         try:
-            data = json.loads(text)
+            data = json_value(text)
             if tuple(data["features"]) != FEATURES:
                 raise ShapeModelError(f"the trees ask about {data['features']}, this program knows {FEATURES}")
             low, high = (np.array(data[name], np.float64) for name in ("low", "high"))
             plain = PlainShapeRule(**data["plain"])
             return cls(forest_from(data), float(data["limit"]), float(data["alike"]), low, high, plain)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise ShapeModelError(f"the file of the fitted trees is damaged: {error}") from error
 
 

@@ -18,8 +18,9 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t, exp_so3
 from gnd.gnd_map.utm import convergence_rad, geodetic_from_utm
 from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.damage import number_table
 from gnd.vehicle_agent.importers.files import check_folder, files_of
-from gnd.vehicle_agent.importers.pcd import read_scan, scan_number, table_of
+from gnd.vehicle_agent.importers.pcd import read_scan, scan_number
 from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
 
 F64 = NDArray[np.float64]
@@ -96,7 +97,7 @@ def poses_from_utm(T_utm: F64, zone: int, southern: bool, frame: LocalFrame) -> 
 
 
 def _poses(path: Path, n: int) -> tuple[NDArray[np.int64], F64]:
-    rows = table_of(path)
+    rows = number_table(path)
     if rows.shape != (n, COLUMNS):
         raise ImportDriveError(f"{path}: table of shape {rows.shape} for {n} scans; a line a scan of 9 is needed")
     whole = np.floor(rows[:, 1])

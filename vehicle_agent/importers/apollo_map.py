@@ -30,7 +30,7 @@ _CELL: Final = struct.Struct("<iffII12f")  # number upwards, intensity, its vari
 _INVERSE_BYTES: Final = 37  # inverse covariance, and whether there is one
 _INVERSE_FROM: Final = 6  # cells of so many points hold it
 _COLUMN_END: Final = struct.Struct("<iiI")  # highest and lowest cell, and how many numbers of road cells follow
-_MAX_NODE_BYTES: Final = 1 << 28
+_MAX_NODE_BYTES: Final = 1 << 26
 _PATTERNS: Final = (r"<x>(\d+)</x>", r"<resolutions><resolution>([\d.]+)<", r"<resolutions_z><resolution>([\d.]+)<")
 
 

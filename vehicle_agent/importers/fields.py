@@ -78,6 +78,9 @@ def unpack(where: str, fields: Sequence[Field], step: int, data: bytes | memoryv
     missing = {"x", "y", "z"} - {field.name for field in fields}
     if missing:
         raise ImportDriveError(f"{where}: no field {', '.join(sorted(missing))}")
+    several = [field.name for field in fields if field.name in ("x", "y", "z") and field.count != 1]
+    if several:
+        raise ImportDriveError(f"{where}: several numbers for {', '.join(several)} of a point")
     if len(data) < n * step:
         raise ImportDriveError(f"{where}: {len(data)} bytes of points, {n * step} announced")
     return np.frombuffer(data, _dtype(where, fields, step), n)

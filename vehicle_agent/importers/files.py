@@ -7,8 +7,8 @@ from typing import Final
 
 from gnd.vehicle_agent.errors import ImportDriveError
 
-MAX_FILE_BYTES: Final = 1 << 30
-"""One scan, unpacked: 64 million points of 16 bytes."""
+MAX_FILE_BYTES: Final = 1 << 26
+"""One scan, unpacked: 4 million points of 16 bytes; a few packed bytes may unpack to any number."""
 MAX_DEPTH: Final = 4
 """Folders below the one that was named that are looked into."""
 

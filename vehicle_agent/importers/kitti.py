@@ -16,6 +16,7 @@ from gnd.gnd_map.se3 import T_inverse
 from gnd.schemas.drive import GnssFix
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.damage import MAX_NUMBER, named_damage, number_table
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of, read_file
 from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Recording, RecordingAnchor, mount
 
@@ -89,7 +90,7 @@ def _times(folder: Path, n: int) -> NDArray[np.int64]:
     files = files_of(folder, *TIME_FILES)
     if not files:
         return START_NS + PERIOD_NS * np.arange(n, dtype=np.int64)
-    seconds = np.loadtxt(files[0], ndmin=1)
+    seconds = number_table(files[0])[:, 0]
     if len(seconds) < n:
         raise ImportDriveError(f"{files[0]}: {len(seconds)} times for {n} scans")
     return START_NS + np.round(seconds[:n] * 1e9).astype(np.int64)
@@ -100,7 +101,7 @@ def _fixes(folder: Path, t_ns: NDArray[np.int64], T_vehicle_lidar: F64, anchor: 
     files = files_of(folder, "poses.txt", "*_gt.txt")
     if not files:
         return ()
-    rows = np.loadtxt(files[0], ndmin=2)
+    rows = number_table(files[0])
     if rows.shape[1] != 12 or len(rows) < len(t_ns):
         raise ImportDriveError(f"{files[0]}: {rows.shape} numbers for {len(t_ns)} scans; 12 a scan are needed")
     T_camera = np.tile(np.eye(4), (len(t_ns), 1, 1))
@@ -125,7 +126,11 @@ def calibration_of(folder: Path) -> F64 | None:
     path = folder / "calib.txt"
     if not path.exists():
         return None
-    for line in path.read_text().splitlines():
-        if line.startswith("Tr:"):
-            return np.vstack([np.array(line.split()[1:], np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    with named_damage(path):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if line.startswith("Tr:"):
+                row = np.array(line.split()[1:], np.float64).reshape(3, 4)
+                if not (np.abs(row) <= MAX_NUMBER).all():
+                    raise ImportDriveError(f"{path}: numbers that are not finite, or beyond {MAX_NUMBER:g}")
+                return np.vstack([row, [0.0, 0.0, 0.0, 1.0]])
     raise ImportDriveError(f"{path}: no line 'Tr:' with the pose of the LiDAR before the camera")

@@ -17,6 +17,7 @@ from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, RawScan
 from gnd.vehicle_agent.importers.fields import LONGEST_SWEEP_NS
 from gnd.vehicle_agent.importers.files import check_folder, files_below
+from gnd.vehicle_agent.importers.las_header import check_las
 from gnd.vehicle_agent.importers.optional import library
 from gnd.vehicle_agent.importers.pcd import PERIOD_NS, START_NS, scan_number
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
@@ -72,9 +73,12 @@ def open_las(folder: Path, anchor: RecordingAnchor | None, choices: Choices | No
 
 def _read(path: Path) -> Any:
     laspy = library("laspy", EXTRA)
+    check_las(path)
     try:
         return laspy.read(path)
-    except Exception as error:
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # a panic of lazrs is no Exception
         raise ImportDriveError(f"{path}: no readable LAS: {' '.join(str(error).split())[:200]}") from error
 
 

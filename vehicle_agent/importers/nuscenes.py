@@ -5,13 +5,13 @@ are `.pcd.bin` files of five float32: x, y, z, intensity, ring. Poses are in the
 north from an origin that nuScenes's tools give; its heights are not told.
 """
 
-import json
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.bounded import json_value
 from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.attached_poses import with_table
@@ -88,7 +88,7 @@ def _open(base: Path, tables: dict[str, dict[str, Row]], anchor: RecordingAnchor
 
 def _table(path: Path) -> dict[str, Row]:
     try:
-        return {row["token"]: row for row in json.loads(path.read_text())}
+        return {row["token"]: row for row in json_value(path.read_text())}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ImportDriveError(f"{path}: no table of nuScenes: {error}") from None
 

@@ -19,6 +19,7 @@ from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.damage import number_table
 from gnd.vehicle_agent.importers.fields import ANY_FIELD, FieldChoice, TimeRule, scan_of_fields, time_rule
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of
 from gnd.vehicle_agent.importers.pcd_format import read_pcd
@@ -88,6 +89,8 @@ def _points(path: Path, fields: tuple[str, ...] = ()) -> NDArray[np.void]:
     missing = {"x", "y", "z"} - set(points.dtype.names or ())
     if missing:
         raise ImportDriveError(f"{path}: no field {', '.join(sorted(missing))}")
+    if any(points.dtype[axis].shape for axis in "xyz"):
+        raise ImportDriveError(f"{path}: several numbers for x, y or z of a point")
     if fields and points.dtype.names != fields:
         held = ", ".join(points.dtype.names or ())
         raise ImportDriveError(f"{path}: fields {held}; the others have {', '.join(fields)}: another sensor?")
@@ -110,7 +113,7 @@ def _track(folder: Path, scans: list[Path]) -> tuple[I64, Trajectory | None]:
     if not files:
         named = stamps_of_names(scans)
         return (START_NS + PERIOD_NS * np.arange(n, dtype=np.int64) if named is None else named), None
-    rows = table_of(files[0])
+    rows = number_table(files[0])
     if len(rows) != n or rows.shape[1] not in (8, 9, 12):
         raise ImportDriveError(
             f"{files[0]}: {len(rows)} lines of {rows.shape[1]} numbers for {n} scans; one line a scan of 8 (t,"
@@ -121,14 +124,6 @@ def _track(folder: Path, scans: list[Path]) -> tuple[I64, Trajectory | None]:
     if rows.shape[1] == 12 and (named := stamps_of_names(scans)) is not None:
         t_ns = named
     return t_ns, Trajectory(t_ns, T)
-
-
-def table_of(path: Path) -> F64:
-    """(N, M) numbers of a text file; ImportDriveError when it holds anything else."""
-    try:
-        return np.loadtxt(path, ndmin=2)
-    except ValueError as error:
-        raise ImportDriveError(f"{path}: {error}") from error
 
 
 def _poses(rows: F64) -> tuple[I64, F64]:

@@ -15,6 +15,8 @@ U8 = NDArray[np.uint8]
 
 MAX_POINTS = 20_000_000
 MAX_HEADER_BYTES = 4096
+MAX_POINT_BYTES = 4096
+_MOST_OF_A_BYTE = 88  # LZF: three bytes stand for 264 at most
 SIZES = {"F": (4, 8), "U": (1, 2, 4, 8), "I": (1, 2, 4, 8)}  # bytes of floats, unsigned and signed integers
 
 
@@ -68,13 +70,24 @@ def _header(lines: dict[str, list[str]]) -> _Header:
     names, sizes, types = lines["FIELDS"], lines["SIZE"], lines["TYPE"]
     counts = lines.get("COUNT", ["1"] * len(names))
     fields = [
-        (name, _type(kind, int(size)), (int(count),)) if count != "1" else (name, _type(kind, int(size)))
+        (name, _type(kind, int(size)), (_count(count),)) if count != "1" else (name, _type(kind, int(size)))
         for name, size, kind, count in zip(names, sizes, types, counts, strict=True)
     ]
     points = int(lines["POINTS"][0])
     if not 0 <= points <= MAX_POINTS:
         raise ValueError(f"POINTS {points} (0 ... {MAX_POINTS})")
-    return _Header(np.dtype(fields), points, lines["DATA"][0])
+    dtype = np.dtype(fields)
+    if not 0 < dtype.itemsize <= MAX_POINT_BYTES:
+        raise ValueError(f"point of {dtype.itemsize} bytes (1 ... {MAX_POINT_BYTES})")
+    return _Header(dtype, points, lines["DATA"][0])
+
+
+def _count(text: str) -> int:
+    """Numbers of a field; numpy makes room for what a dtype says."""
+    count = int(text)
+    if not 1 <= count <= MAX_POINT_BYTES:
+        raise ValueError(f"COUNT {count} (1 ... {MAX_POINT_BYTES})")
+    return count
 
 
 def _type(kind: str, size: int) -> str:
@@ -85,8 +98,9 @@ def _type(kind: str, size: int) -> str:
 
 def _from_ascii(path: Path, header: _Header, body: bytes) -> NDArray[np.void]:
     try:
-        rows = np.loadtxt(io.BytesIO(body), dtype=header.dtype, ndmin=1)
-    except ValueError as error:
+        lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
+        rows = np.loadtxt(lines, dtype=header.dtype, ndmin=1) if lines else np.empty(0, header.dtype)
+    except (ValueError, OverflowError) as error:
         raise ImportDriveError(f"{path}: {error}") from error
     if len(rows) != header.points:
         raise ImportDriveError(f"{path}: {len(rows)} points, {header.points} announced")
@@ -103,6 +117,8 @@ def _from_columns(path: Path, header: _Header, body: bytes) -> NDArray[np.void]:
         raise ImportDriveError(
             f"{path}: {len(body) - 8} of {packed_size} compressed bytes, {size} uncompressed, {needed} announced"
         )
+    if size > _MOST_OF_A_BYTE * packed_size:
+        raise ImportDriveError(f"{path}: {packed_size} compressed bytes cannot hold {size}")
     columns = np.zeros(size, np.uint8)
     if _lzf_decompress(np.frombuffer(body, np.uint8, packed_size, 8), columns) != size:
         raise ImportDriveError(f"{path}: compressed points are damaged")

@@ -14,7 +14,8 @@ from gnd.gnd_map.errors import MotionError, ShapeError
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.tile_store.feature_io.placement import Placement
-from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.errors import ImportDriveError, LocaliseError
+from gnd.vehicle_agent.importers.damage import number_table
 from gnd.vehicle_agent.localise.path_association import Untimed, georeference_untimed
 
 SIGMA_M: Final = 0.5
@@ -63,9 +64,9 @@ def read_fixes(path: Path, sigma_m: float = SIGMA_M) -> Untimed:
 
 def _table(path: Path, columns: int) -> F64:
     try:
-        rows = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise LocaliseError(f"{path}: no table of numbers: {error}") from None
+        rows = number_table(path)
+    except ImportDriveError as error:
+        raise LocaliseError(str(error)) from None
     if len(rows) < 2 or rows.shape[1] != columns:
         raise LocaliseError(f"{path}: {len(rows)} lines of {rows.shape[1]} columns; at least 2 of {columns} are needed")
     return rows

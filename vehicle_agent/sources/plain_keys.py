@@ -16,6 +16,7 @@ from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusError, NoRouter
 from gnd.fleet_bus.subscribing import Subscription
+from gnd.gnd_map.bounded import json_value
 from gnd.schemas.drive import DriveHeader
 from gnd.schemas.drive_mcap import ITEM_TOPICS, POINTS_TOPIC, item_of
 from gnd.schemas.drive_metadata import header_of, metadata_of
@@ -40,11 +41,11 @@ def read_header_message(body: bytes) -> tuple[DriveHeader, list[str]]:
         SchemaError: it did not write this.
     """
     try:
-        told = json.loads(body)
+        told = json_value(body)
         mount = np.array(told["T_vehicle_lidar"], np.float64)
         topics = [str(topic) for topic in told["topics"]]
         header = header_of({str(key): str(value) for key, value in told["metadata"].items()}, mount)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise BadValue(f"{len(body)} bytes are no header of a vehicle that drives now: {error}") from error
     if unknown := set(topics) - set(ITEM_TOPICS):
         raise BadValue(f"topics of no drive: {', '.join(sorted(unknown))}")

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +30,9 @@ CLASSES: Final = ("normal", "new", "modified", "deleted", "empty")
 CHANGES: Final = ("new", "modified", "deleted")
 LEVELS: Final = ("observable", "all", "scored")
 MERGED: Final = "merged"
+MOST: Final = 1e9
+"""No world has a voxel or a metre so far away."""
 
-_FARTHEST: Final = 1e7
-"""No voxel or point of a world has a larger coordinate, metres or voxels."""
 _A_M, _F, _LON_TILES = 6378137.0, 1.0 / 298.257223563, 1 << 20  # WGS-84; tiles along the equator
 
 
@@ -122,10 +121,17 @@ class ScoredWorld:
         try:
             frame = VoxelFrame.read(world / "frame.json")
             gaussians = np.loadtxt(world / "map_before" / "gaussians.csv", delimiter=",", skiprows=1, ndmin=2)
-            with truth.open("rb") as file, np.load(file, allow_pickle=False) as columns:
+            with truth.open("rb") as stream, np.load(stream, allow_pickle=False) as columns:
                 data = dict(columns)
-        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-            raise SubmissionError(f"world {name} of {folder} cannot be read: {error}") from error
+            return cls._of(frame, vehicles, gaussians, data)
+        except Exception as error:  # a damaged table or archive leads to any of numpy's, zipfile's, zlib's and json's
+            reason = f"{type(error).__name__}: {error}"
+            raise SubmissionError(f"world {name} of {folder} cannot be read: {reason[:300]}") from error
+
+    @classmethod
+    def _of(
+        cls, frame: VoxelFrame, vehicles: Sequence[str], gaussians: F64, data: Mapping[str, NDArray[Any]]
+    ) -> "ScoredWorld":
         keys = frame.keys_of(data["ijk"].astype(np.int64))
         order = np.argsort(keys)
         observable, clear = data["observable"][order], data["clear"][order]
@@ -192,7 +198,7 @@ def _rows(path: Path) -> Iterator[_Row]:
                 yield from (_row(path, line, json.loads(text)) for line, text in enumerate(file, 1) if text.strip())
             else:
                 raise SubmissionError(f"{path}: a submission is a .csv or a .jsonl file")
-    except (OSError, ValueError, csv.Error, RecursionError) as error:  # no UTF-8, no JSON, numbers of 5,000 digits
+    except (OSError, ValueError, RecursionError, csv.Error) as error:
         raise SubmissionError(f"{path} cannot be read: {error}") from error
 
 
@@ -210,8 +216,8 @@ def _row(path: Path, line: int, found: Any) -> _Row:
         x, y, z = (float(found[name]) for name in names)
     except (TypeError, ValueError, OverflowError) as error:
         raise SubmissionError(f"{where}: {error}") from error
-    if not all(abs(number) < _FARTHEST for number in (x, y, z)):  # nor is NaN
-        raise SubmissionError(f"{where}: {', '.join(names)} = {x}, {y}, {z}: numbers below {_FARTHEST:g} are needed")
+    if not all(abs(number) <= MOST for number in (x, y, z)):  # NaN fails, too
+        raise SubmissionError(f"{where}: {', '.join(names)} = {x}, {y}, {z}: finite numbers are needed, up to {MOST:g}")
     if names[0] == "i" and not all(number.is_integer() for number in (x, y, z)):
         raise SubmissionError(f"{where}: i, j, k = {x}, {y}, {z}: integers are needed")
     who = found.get("vehicle") or MERGED
@@ -343,13 +349,19 @@ def read_worlds(folder: Path) -> dict[str, ScoredWorld]:
     """
     try:
         found = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SubmissionError(f"{folder} is no exported benchmark: {error}") from error
-    if not isinstance(found, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
+    if not isinstance(found, dict):
+        raise SubmissionError(f"{folder}/benchmark.json holds no object")
+    if (found.get("format"), found.get("version")) != (FORMAT, VERSION):
         raise SubmissionError(f"{folder}/benchmark.json is not of format {FORMAT}, version {VERSION}")
     if not found.get("finished"):
         raise SubmissionError(f"the export into {folder} has not ended: start it again, it goes on where it was")
-    return {one["name"]: ScoredWorld.read(folder, one["name"], one["vehicles"]) for one in found["worlds"]}
+    try:
+        worlds = [(str(one["name"]), tuple(map(str, one["vehicles"]))) for one in found["worlds"]]
+    except (KeyError, TypeError) as error:
+        raise SubmissionError(f"{folder}/benchmark.json: worlds with names and vehicles are needed: {error}") from error
+    return {name: ScoredWorld.read(folder, name, vehicles) for name, vehicles in worlds}
 
 
 # --- the command ----------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ Read are the flat form (firmware to 2.x: every key at the top, `data_format`) an
 `beam_intrinsics`, `lidar_intrinsics`, `lidar_data_format`, `config_params`). Angles are degrees, lengths mm.
 """
 
-import json
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.bounded import json_value
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.ouster.packets import PROFILES, LidarProfile
 
@@ -60,7 +60,7 @@ class OusterMetadata:
                 f"{self.path}: {self.columns} columns a frame, {self.columns_per_packet} a packet, window {self.window}"
             )
         for T in (self.T_lidar_beam, self.T_sensor_lidar):
-            R = T[:3, :3]
+            R = np.clip(T[:3, :3], -2.0, 2.0)  # products of huge numbers overflow
             if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > ROUNDED:
                 raise ImportDriveError(f"{self.path}: a transform that is no rigid 4x4 matrix: {T.tolist()}")
 
@@ -96,7 +96,7 @@ def read_metadata(path: Path) -> OusterMetadata:
         ImportDriveError: no such JSON, a key is missing, or a profile that is not known.
     """
     try:
-        content = json.loads(path.read_bytes())
+        content = json_value(path.read_bytes())
     except (OSError, ValueError) as error:
         raise ImportDriveError(f"{path}: no readable JSON: {error}") from error
     if not isinstance(content, dict):
@@ -107,7 +107,7 @@ def read_metadata(path: Path) -> OusterMetadata:
         return _metadata(path, values)
     except KeyError as error:
         raise ImportDriveError(f"{path}: metadata of a sensor without {error.args[0]!r}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ImportDriveError(f"{path}: metadata of a sensor: {' '.join(str(error).split())[:200]}") from error
 
 

@@ -46,6 +46,7 @@ NAMES: Final[Mapping[str, tuple[str, ...]]] = {
     "sn": ("sdn", "sdnorth", "stdnorth", "northstd", "sigman", "latitudestd", "latstd"),
     "se": ("sde", "sdeast", "stdeast", "eaststd", "sigmae", "longitudestd", "lonstd"),
 }  # fmt: skip
+_LONGEST_NAME: Final = 80
 _UNIT: Final = re.compile(r"[(\[]\s*([^)\]]*)\s*[)\]]|[_ ](deg|rad|m|s|ns|us|ms|sec)$", re.IGNORECASE)
 _HEADING_OFF_RAD: Final = np.radians(30.0)
 
@@ -70,6 +71,8 @@ def columns_of(names: Sequence[str]) -> dict[str, tuple[int, str]]:
     """Which of the columns is what, and the unit in its name (lower case; empty where there is none)."""
     found: dict[str, tuple[int, str]] = {}
     for k, name in enumerate(names):
+        if len(name) > _LONGEST_NAME:  # prose: searching it for a unit takes the square of its length
+            continue
         unit = _UNIT.search(name.strip())
         plain = re.sub(r"[^a-z]", "", (name[: unit.start()] if unit else name).lower())
         for key, known in NAMES.items():

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.damage import named_damage
 from gnd.vehicle_agent.importers.files import read_file
 from gnd.vehicle_agent.importers.trajectories.columns import is_header, table_of_columns
 from gnd.vehicle_agent.importers.trajectories.geojson import table_of_geojson
@@ -23,6 +24,11 @@ def read_poses(path: Path) -> PoseTable:
     Raises:
         ImportDriveError: no such file, none of the known kinds, or damaged; with the line.
     """
+    with named_damage(path):
+        return _read(path)
+
+
+def _read(path: Path) -> PoseTable:
     if not path.is_file():
         raise ImportDriveError(f"{path}: no such file of poses")
     data = read_file(path)

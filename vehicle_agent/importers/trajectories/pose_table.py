@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.damage import MAX_NUMBER
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -38,8 +39,8 @@ class PoseTable:
     def __post_init__(self) -> None:
         if len(self.p) < 2:
             raise ImportDriveError(f"{self.source}: {len(self.p)} poses; at least 2 are needed")
-        if not np.isfinite(self.p).all() or (self.R is not None and not np.isfinite(self.R).all()):
-            raise ImportDriveError(f"{self.source}: a position or rotation is not finite")
+        if not (np.abs(self.p) <= MAX_NUMBER).all() or (self.R is not None and not np.isfinite(self.R).all()):
+            raise ImportDriveError(f"{self.source}: a position or rotation is not finite, or beyond {MAX_NUMBER:g} m")
         if self.t_ns is None:
             return
         late = np.flatnonzero(np.diff(self.t_ns) <= 0)
