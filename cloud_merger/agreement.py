@@ -1,8 +1,8 @@
 """How what each report says of a tile agrees with what others saw within the same half hour.
 
 A vehicle whose statements are contradicted by two or more others, nearly all of them and in tile after tile, is wrong:
-its LiDAR is mounted otherwise than it believes, its poses are bad, or it lies. That needs no knowledge of the truth, and
-no vehicle is its own witness. Single contradictions are normal: things move, and are seen from one side only.
+its LiDAR is mounted otherwise than it believes, its poses are bad, or it lies. No truth is needed for that, and no
+vehicle is its own witness. Single contradictions are normal: things move, and are seen from one side only.
 
 A function of the window's reports alone, not of who is believed: so who is named depends on the journal, in any order.
 """

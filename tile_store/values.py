@@ -596,10 +596,10 @@ class Publication:
     """A merge's result: the new content, or None when nothing visible has changed.
 
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
-    each changed feature, when known. `waiting` is what the reports claim and the content has not;
-    None: as before. `shift_tests`, `agreement_tests` and `courses` are those of this tile's reports, which add to the
-    accounts of their vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have
-    come to, where any was folded.
+    each changed feature, when known. `waiting` is what the reports claim and the content has not; None: as before.
+    `shift_tests`, `agreement_tests` and `courses` are those of this tile's reports, which add to the accounts of their
+    vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have come to,
+    where any was folded.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
