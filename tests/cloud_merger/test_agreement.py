@@ -36,7 +36,7 @@ def wall_of(tile: TileId) -> list[int]:
 
 def ground_of(tile: TileId) -> list[int]:
     grid = VoxelGrid.of(tile)
-    return sorted(int(grid.voxel_id(x, y, 39)) for x in range(3, 3 + WIDE) for y in (9, 10))
+    return sorted(int(grid.voxel_id(x, y, 39)) for x in range(3, 3 + WIDE) for y in (7, 8, 9, 10))
 
 
 def base_of(tile: TileId) -> Gaussians:
@@ -221,7 +221,7 @@ def test_what_parks_is_nobodys_fault(store: SqliteStore) -> None:
     cars = {}
     for tile in TILES:
         grid = VoxelGrid.of(tile)
-        parked = [int(grid.voxel_id(x0 + x, 9 + y, 40)) for x0 in (4, 14) for x in range(4) for y in range(2)]
+        parked = [int(grid.voxel_id(x0 + x, 7 + y, 40)) for x0 in (4, 14) for x in range(4) for y in range(2)]
         cars[tile] = dict.fromkeys(parked, CAR)
     seen = {tile: sorted({*observed(tile), *cars[tile]}) for tile in TILES}
 
