@@ -8,6 +8,7 @@ A function of the window's reports alone, not of who is believed: so who is name
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -29,14 +30,32 @@ REFUTED_QUOTES: Final = 0.8
 """... or this share of what it says is as it was, where they say that it has changed: that is missed more easily."""
 DENIED_CLAIM: Final = 2
 DENIED_QUOTE: Final = 3
-"""So many others must contradict a statement, and more than twice as many as agree with it."""
+"""So many others must contradict a statement, and more than agree with it. Of a claim those who came later count: what
+has just changed is contradicted by nobody who came before. Of "as it was" those count who came earlier."""
+CONTRADICTED_VOXELS: Final = 8
+CONTRADICTED_SHARE: Final = 0.5
+"""Who is contradicted in so many voxels of a tile, and in this share of what others can judge, is not believed alone
+there: of two vehicles that say the opposite nobody knows who is right."""
 
 Mask = NDArray[np.bool_]
 I64 = NDArray[np.int64]
 
 
-def agreement_tests(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> tuple[AgreementTest, ...]:
-    """The test of each report that others can judge.
+@dataclass(frozen=True, slots=True, eq=False)
+class Agreement:
+    """What the reports of a window say about each other.
+
+    Attributes:
+        tests: of each report that others can judge.
+        contradicted: the vehicles that are not believed alone in this tile.
+    """
+
+    tests: tuple[AgreementTest, ...] = ()
+    contradicted: frozenset[str] = frozenset()
+
+
+def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> Agreement:
+    """How the reports of a window agree.
 
     Args:
         epoch: the tile that the reports are merged into.
@@ -44,29 +63,56 @@ def agreement_tests(epoch: Gaussians, statements: Statements, for_epoch: Mask) -
         for_epoch: (M,) which of them say that a voxel is as in the epoch.
     """
     reports, rows = statements.reports, statements.rows
-    if len({one.vehicle for one in reports}) < 1 + DENIED_CLAIM or not len(rows):
-        return ()
+    if len({one.vehicle for one in reports}) < 2 or not len(for_epoch):
+        return Agreement()
     told = np.flatnonzero((rows["report"] >= 0) & (rows["report"] < len(reports)))
-    rows, quotes = rows[told], for_epoch[told] & ~rows["claim"][told] if len(for_epoch) else np.zeros(len(told), bool)
-    voxel = np.unique(rows["voxel_id"], return_inverse=True)[1]
-    gone = rows["claim"] & (rows["kind"] == Kind.NOTHING)
-    there = rows["claim"] & (rows["kind"] != Kind.NOTHING)
-    n_gone, n_there, n_quotes = (_counted(voxel, which) for which in (gone, there, quotes))
-    agree = np.where(gone, n_gone, np.where(there, n_there, n_quotes)) - 1
-    deny = np.where(rows["claim"], n_quotes, np.maximum(n_gone, n_there))
-    least = np.where(rows["claim"], DENIED_CLAIM, DENIED_QUOTE)
-    refuted = (deny >= least) & (deny > 2 * agree)
-    judged = (agree + deny >= least) & (rows["claim"] | quotes)
+    time_ns = np.array([one.last_ns for one in reports], np.int64)[rows["report"][told]]
+    told = told[np.lexsort((rows["report"][told], time_ns, rows["voxel_id"][told]))]
+    rows, quotes = rows[told], for_epoch[told] & ~rows["claim"][told]
+    claim = rows["claim"]
+    gone, there = claim & (rows["kind"] == Kind.NOTHING), claim & (rows["kind"] != Kind.NOTHING)
+    (gone_before, gone_after), (there_before, there_after), (quotes_before, quotes_after) = (
+        _around(rows["voxel_id"], which) for which in (gone, there, quotes)
+    )
+    contradicted = _contradicted(
+        reports,
+        rows["report"],
+        claim,
+        np.where(gone, gone_before + gone_after, there_before + there_after),
+        quotes_before + quotes_after,
+    )
+    agree = np.where(gone, gone_after, np.where(there, there_after, quotes_before))
+    deny = np.where(claim, quotes_after, np.maximum(gone_before, there_before))
+    least = np.where(claim, DENIED_CLAIM, DENIED_QUOTE)
+    judged = (agree + deny >= least) & (claim | quotes)
+    refuted = judged & (deny >= least) & (deny > agree)
     tests = []
     for number, report in enumerate(reports):
         own = rows["report"] == number
-        tests.append(_test_of(report, rows["voxel_id"], own & judged, own & refuted & judged, rows["claim"], epoch))
-    return tuple(one for one in tests if one is not None)
+        tests.append(_test_of(report, rows["voxel_id"], own & judged, own & refuted, claim, epoch))
+    return Agreement(tuple(one for one in tests if one is not None), contradicted)
 
 
-def _counted(voxel: I64, which: Mask) -> I64:
-    """(M,) how many rows of `which` each row's voxel has."""
-    return np.bincount(voxel[which], minlength=int(voxel.max(initial=0)) + 1)[voxel]
+def _around(voxel_id: NDArray[np.int32], which: Mask) -> tuple[I64, I64]:
+    """(M,) how many rows of `which` come before and behind each row in its voxel; `voxel_id` is sorted."""
+    first = np.append(True, voxel_id[1:] != voxel_id[:-1])[: len(voxel_id)]
+    group = np.cumsum(first) - 1
+    until = np.cumsum(which)
+    start = (until - which)[first][group]
+    total = np.bincount(group, weights=which).astype(np.int64)[group]
+    before = until - which - start
+    return before, total - before - which
+
+
+def _contradicted(
+    reports: Sequence[Report], report: NDArray[np.int32], claim: Mask, agree: I64, deny: I64
+) -> frozenset[str]:
+    """Vehicles of whose claims others deny many; somebody else must have seen the voxel."""
+    judged, denied = claim & (agree + deny > 0), claim & (deny > agree)
+    n_judged = np.bincount(report[judged], minlength=len(reports))
+    n_denied = np.bincount(report[denied], minlength=len(reports))
+    found = (n_denied >= CONTRADICTED_VOXELS) & (n_denied >= CONTRADICTED_SHARE * n_judged)
+    return frozenset(one.vehicle for one, is_found in zip(reports, found, strict=True) if is_found and one.vehicle)
 
 
 def _test_of(
@@ -107,8 +153,3 @@ def _passing(report: Report, claimed: NDArray[np.int32], epoch: Gaussians) -> ND
         follows_season(grid, epoch, left, come),
     ]
     return np.intersect1d(np.concatenate(found), claimed).astype(np.int32)
-
-
-def of_vehicles(reports: Sequence[Report], vehicles: frozenset[str]) -> frozenset[str]:
-    """Ids of the reports that some vehicles have made."""
-    return frozenset(one.report_id for one in reports if one.vehicle in vehicles)

@@ -12,7 +12,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.cloud_merger.agreement import agreement_tests
+from gnd.cloud_merger.agreement import Agreement, agreement_of
 from gnd.cloud_merger.belief import Believed, ShiftTests, believed
 from gnd.cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate
 from gnd.cloud_merger.memory import (
@@ -99,7 +99,7 @@ class WindowMerger:
 
         `lattice`: on which the tile lies; None: none.
         """
-        rules, tests = self.rules, tuple[AgreementTest, ...]()
+        rules, agreement = self.rules, Agreement()
         out = frozenset(name.removeprefix(QUARANTINED) for name in self.named if name.startswith(QUARANTINED))
         named = frozenset(name for name in self.named if not name.startswith(QUARANTINED))
         if rules.has_paper_rules:  # they know neither shift tests nor a gate nor a memory
@@ -111,7 +111,7 @@ class WindowMerger:
             in_play = believed(reports, shifts, named)
             statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
             merged = merge_tile(state.gaussians, statements, rules)
-            tests = agreement_tests(state.gaussians, statements, merged.for_epoch)
+            agreement = agreement_of(state.gaussians, statements, merged.for_epoch)
             if out & {one.vehicle for one in in_play.reports}:
                 in_play = in_play.without(out)
                 statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
@@ -120,11 +120,11 @@ class WindowMerger:
             standing = state.memory.parked, self.bases, self.confirmation.parked_h
             bare, leaves = hold_season(state.gaussians, merged, seen)
             free = hold_parked(state.gaussians, bare, seen, *standing)
-            found = gate(state.gaussians, free.merged, seen, self.confirmation, named, witnesses=by)
+            found = gate(state.gaussians, free.merged, seen, self.confirmation, named, by, agreement.contradicted)
             gated = GatedTile(found.merged, (*found.waiting, *free.waiting, *leaves, *in_play.set_aside))
             parked = free.voxels
         gaussians = self._on_lattice(gated.merged, reports, lattice)
-        return MergedWindow(in_play, statements, gated, gaussians, parked, self.bases, tests)
+        return MergedWindow(in_play, statements, gated, gaussians, parked, self.bases, agreement.tests)
 
     def _on_lattice(self, merged: MergedTile, reports: Sequence[Report], lattice: Lattice | None) -> Gaussians:
         if lattice is None:

@@ -21,7 +21,9 @@ from gnd.tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
-WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named", "parked", "season", "quarantined"]
+WaitingReason = Literal[
+    "share", "isolated", "poses", "doubtful", "shift", "named", "parked", "season", "contradicted", "quarantined"
+]
 QUARANTINED: Final = "!"
 """Before the name of a vehicle among those named: its reports do not count at all."""
 
@@ -432,6 +434,7 @@ class Unconfirmed:
             reports with poor poses only; "doubtful": the vehicle doubts it itself; "shift": a shift of its poses
             explains it; "named": its reports are shifted again and again; "parked": it has the shape of a vehicle
             and has not stood for long, whoever saw it; "season": it came or went in the crown of a tree that stayed;
+            "contradicted": others contradict most of what the vehicle claims there;
             "quarantined": of a vehicle whose reports do not count.
     """
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -58,8 +59,13 @@ def says(number: int, vehicle: str, changed: Mapping[TileId, Mapping[int, object
     found = []
     for k, tile in enumerate(TILES):
         change = change_of(base_of(tile), observed(tile), changed.get(tile, {}), tile=tile)  # type: ignore[arg-type]
-        found.append(report_of(100 * number + k, change, vehicle=vehicle))
+        found.append(at(number, report_of(100 * number + k, change, vehicle=vehicle)))
     return found
+
+
+def at(number: int, report: ChangeReport) -> ChangeReport:
+    """Vehicles drive a minute after each other, in the order of their numbers."""
+    return replace(report, first_ns=NS + (60 * number - 20) * 10**9, last_ns=NS + 60 * number * 10**9)
 
 
 @pytest.fixture
@@ -98,8 +104,8 @@ UNTOUCHED = [content_sha(tile, base_of(tile)) for tile in TILES]
 
 
 def test_who_deletes_what_others_see_is_named_and_counts_no_more(store: SqliteStore) -> None:
-    take(store, [*says(1, "a", NOTHING), *says(2, "b", NOTHING)])
-    take(store, says(3, "bad", GONE))
+    take(store, says(1, "bad", GONE))
+    take(store, [*says(2, "a", NOTHING), *says(3, "b", NOTHING), *says(4, "c", BUILT)])
     assert store.quarantined_vehicles() == {"bad"}
     (bad,) = [one for one in store.vehicle_trusts() if one.vehicle == "bad"]
     assert (bad.tested, bad.refuted, bad.refuted_claims) == (4, 4, 4 * 2 * WIDE)
@@ -109,14 +115,21 @@ def test_who_deletes_what_others_see_is_named_and_counts_no_more(store: SqliteSt
     assert {one.reason for one in store.waiting_changes() if one.vehicle == "bad"} == {"quarantined"}
 
 
+def test_what_has_just_changed_names_nobody(store: SqliteStore) -> None:
+    """Others came before: that they saw a wall does not contradict who comes later and sees none."""
+    take(store, [*says(1, "a", NOTHING), *says(2, "b", NOTHING), *says(3, "late", GONE)])
+    assert store.quarantined_vehicles() == frozenset()
+    assert shas(store) == UNTOUCHED  # one voice against two
+
+
 def test_who_invents_is_named(store: SqliteStore) -> None:
-    take(store, [*says(1, "a", NOTHING), *says(2, "b", NOTHING), *says(3, "bad", BUILT)])
+    take(store, [*says(2, "a", NOTHING), *says(3, "b", NOTHING), *says(1, "bad", BUILT)])
     assert store.quarantined_vehicles() == {"bad"}
     assert shas(store) == UNTOUCHED
 
 
 def test_who_says_that_nothing_has_changed_is_named_by_three(store: SqliteStore) -> None:
-    take(store, [*says(1, "a", GONE), *says(2, "b", GONE), *says(3, "old", NOTHING)])
+    take(store, [*says(1, "a", GONE), *says(2, "b", GONE), *says(5, "old", NOTHING)])
     assert store.quarantined_vehicles() == frozenset()
     take(store, says(4, "c", GONE))
     assert store.quarantined_vehicles() == {"old"}
@@ -155,13 +168,13 @@ def test_road_works_name_nobody(store: SqliteStore) -> None:
 
 def test_one_wrong_tile_is_forgiven(store: SqliteStore) -> None:
     once = {TILES[0]: GONE[TILES[0]]}
-    take(store, [*says(1, "a", NOTHING), *says(2, "b", NOTHING), *says(3, "once", once)])
+    take(store, [*says(2, "a", NOTHING), *says(3, "b", NOTHING), *says(1, "once", once)])
     assert store.quarantined_vehicles() == frozenset()
     assert shas(store) == UNTOUCHED
 
 
 def test_the_order_of_arrival_decides_nothing(tmp_path: Path) -> None:
-    fleet = [says(1, "a", NOTHING), says(2, "bad", GONE), says(3, "b", NOTHING), says(4, "worse", BUILT)]
+    fleet = [says(3, "a", NOTHING), says(1, "bad", GONE), says(4, "b", NOTHING), says(2, "worse", BUILT)]
     ends = []
     for k, order in enumerate(([0, 2, 1, 3], [2, 3, 0, 1], [1, 0, 2, 3])):
         with SqliteStore(tmp_path / f"{k}.sqlite", StoreConfig(merge_delay_s=0.0)) as store:
@@ -174,7 +187,7 @@ def test_the_order_of_arrival_decides_nothing(tmp_path: Path) -> None:
 
 def test_every_version_is_recomputed_with_who_counted_then(store: SqliteStore) -> None:
     take(store, says(1, "bad", {tile: dict(list(gone.items())[:8]) for tile, gone in GONE.items()}))
-    take(store, [*says(2, "a", NOTHING), *says(3, "b", NOTHING), *says(4, "bad", GONE), *says(5, "c", NOTHING)])
+    take(store, [*says(3, "a", NOTHING), *says(4, "b", NOTHING), *says(2, "bad", GONE), *says(5, "c", BUILT)])
     assert store.quarantined_vehicles() == {"bad"}
     verifier = Verifier(store, ShardConfig("one", store.path))
     for tile in TILES:
@@ -200,13 +213,13 @@ def test_an_operator_quarantines_and_releases(store: SqliteStore, tmp_path: Path
 
 
 def test_who_is_released_is_pardoned_once(store: SqliteStore) -> None:
-    take(store, [*says(1, "a", NOTHING), *says(2, "b", NOTHING), *says(3, "bad", GONE)])
+    take(store, [*says(2, "a", NOTHING), *says(3, "b", NOTHING), *says(1, "bad", GONE)])
     assert store.quarantined_vehicles() == {"bad"}
     assert store.release_vehicle("bad")
     take(store, [])
     assert store.quarantined_vehicles() == frozenset()
     assert shas(store) == UNTOUCHED
-    take(store, [*says(14, "a", NOTHING), *says(15, "b", NOTHING), *says(16, "bad", GONE)])
+    take(store, [*says(15, "a", NOTHING), *says(16, "b", NOTHING), *says(14, "bad", GONE)])
     assert store.quarantined_vehicles() == {"bad"}
     assert not store.release_vehicle("nobody")
 
@@ -230,8 +243,8 @@ def test_what_parks_is_nobodys_fault(store: SqliteStore) -> None:
             change_of(base_of(tile), seen[tile], changed.get(tile, {}), tile=tile)  # type: ignore[arg-type]
             for tile in TILES
         ]
-        return [report_of(100 * number + k, change, vehicle=vehicle) for k, change in enumerate(changes)]
+        return [at(number, report_of(100 * number + k, one, vehicle=vehicle)) for k, one in enumerate(changes)]
 
-    take(store, [*all_say(1, "a", NOTHING), *all_say(2, "b", NOTHING), *all_say(3, "honest", cars)])
+    take(store, [*all_say(2, "a", NOTHING), *all_say(3, "b", NOTHING), *all_say(1, "honest", cars)])
     assert all(one.refuted == 0 for one in store.vehicle_trusts())
     assert store.quarantined_vehicles() == frozenset()
