@@ -19,7 +19,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.similarity import similarity
 from gnd.schemas.changes import TileChange
 from gnd.schemas.doubt import DoubtReason
-from gnd.tile_store.values import CourseSaid, ShiftTest, Unconfirmed
+from gnd.tile_store.values import CourseSaid, ShiftTest, Unconfirmed, WaitingReason
 
 ALIKE: Final = 0.5  # similarity of two claims
 AGREE_VOXELS: Final = 12
@@ -40,6 +40,15 @@ class Believed:
     reports: tuple[Report, ...]
     set_aside: tuple[Unconfirmed, ...]
     tests: tuple[ShiftTest, ...]
+
+    def without(self, vehicles: frozenset[str]) -> "Believed":
+        """The same, with all reports of these vehicles set aside."""
+        out = [one for one in self.reports if one.vehicle in vehicles]
+        return Believed(
+            tuple(one for one in self.reports if one.vehicle not in vehicles),
+            (*self.set_aside, *_claims(out, "quarantined")),
+            self.tests,
+        )
 
 
 class ShiftTests:
@@ -129,20 +138,20 @@ def _claimed(change: TileChange) -> NDArray[np.int32]:
     return change.changed.voxel_id[~is_withheld(change)]
 
 
-def _claims(reports: Iterable[Report]) -> tuple[Unconfirmed, ...]:
+def _claims(reports: Iterable[Report], reason: WaitingReason = "shift") -> tuple[Unconfirmed, ...]:
     """What the reports claim in vain, by vehicle."""
     found: dict[str, list[Report]] = {}
     for report in reports:
         found.setdefault(report.vehicle, []).append(report)
-    return tuple(_claim(vehicle, own) for vehicle, own in sorted(found.items()))
+    return tuple(_claim(vehicle, own, reason) for vehicle, own in sorted(found.items()))
 
 
-def _claim(vehicle: str, own: list[Report]) -> Unconfirmed:
+def _claim(vehicle: str, own: list[Report], reason: WaitingReason) -> Unconfirmed:
     claimed = np.unique(np.concatenate([one.change.changed.voxel_id for one in own]))
     withheld = max(0 if one.change.doubt is None else one.change.doubt.withheld for one in own)
     voxels = max(len(claimed), withheld, 1)
     seen = len(np.unique(np.concatenate([one.change.observed for one in own])))
-    return Unconfirmed(vehicle, tuple(one.report_id for one in own), voxels, max(seen, voxels), "shift")
+    return Unconfirmed(vehicle, tuple(one.report_id for one in own), voxels, max(seen, voxels), reason)
 
 
 def _test_of(report: Report, shift: CommonShift, is_explained: bool) -> ShiftTest:

@@ -106,6 +106,7 @@ def gate(
     parameters: ConfirmationParameters | None = None,
     named: frozenset[str] = frozenset(),
     witnesses: Iterable[Witness] = (),
+    contradicted: frozenset[str] = frozenset(),
 ) -> GatedTile:
     """Take back the changes that wait for confirmation.
 
@@ -121,6 +122,7 @@ def gate(
         named: vehicles whose reports are shifted again and again: what they alone claim always waits, and they are
             never a second witness of themselves or of each other.
         witnesses: whose claims of earlier windows take part in the merge.
+        contradicted: vehicles that others contradict in this tile: what they alone claim waits, however little it is.
     """
     parameters = parameters or ConfirmationParameters()
     by_report = {report.report_id: report for report in reports}
@@ -133,6 +135,8 @@ def gate(
     for vehicle, witness in sorted(lonely.items()):
         seen = seen_of(vehicle, epoch, by_report.values())
         reasons = _waiting_of(witness, seen, None if len(epoch) == 0 else isolated, parameters)
+        if vehicle in contradicted and len(epoch):
+            reasons = dict.fromkeys(witness.lonely, "contradicted")
         if vehicle in named:
             reasons = dict.fromkeys(witness.lonely, "named")
         waits |= {voxel: (vehicle, reason) for voxel, reason in reasons.items()}

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable
 
 from gnd.cloud_merger.errors import BadReport
+from gnd.fleet_bus.seals import Holder
 from gnd.gnd_map.features import is_feature_layer
 from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError
@@ -40,8 +41,13 @@ class Ingest:
     ) -> None:
         self._store, self._home, self._on_stored, self._now_ns = store, home, on_stored, now_ns
 
-    def answer(self, key: str, payload: bytes) -> ChangeAck:
+    def answer(self, key: str, payload: bytes, asker: Holder | None = None) -> ChangeAck:
         """The ack of one message: "stored" and "duplicate" only when its bytes are durable.
+
+        Args:
+            key: where it came.
+            payload: the message.
+            asker: who has sealed it, where seals are demanded.
 
         Raises:
             StoreError: it could not be kept; the vehicle is to send it again.
@@ -51,6 +57,7 @@ class Ingest:
             head = head_of_upload(payload)
             report_id = head.report_id
             check_head(key, head, received_ns)
+            self._check_asker(head, asker)
         except (SchemaError, BadReport) as error:
             return self._refuse(key, payload, report_id, error)
         upload = Upload(key, payload, report_id, head.vehicle, head.form, received_ns)
@@ -58,6 +65,15 @@ class Ingest:
         if status == "stored":
             self._on_stored()
         return ChangeAck(report_id, status)
+
+    def _check_asker(self, head: UploadHead, asker: Holder | None) -> None:
+        """Who seals a report must be who it says it is of; Gaussians do not say it, but their flags did."""
+        if asker is None:
+            return
+        if head.vehicle and head.vehicle != asker.name:
+            raise BadReport(f"report {head.report_id} of {head.vehicle} was sealed by {asker}")
+        if not head.vehicle and not self._store.upload_statuses(asker.name, [head.report_id]):
+            raise BadReport(f"Gaussians of report {head.report_id}, of which {asker} has sent no flags")
 
     def _refuse(self, key: str, payload: bytes, report_id: str, error: Exception) -> ChangeAck:
         reason = one_line(f"{type(error).__name__}: {error}")

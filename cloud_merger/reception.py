@@ -14,6 +14,7 @@ from typing import Final
 from gnd.cloud_merger.ownership import ROLE, Members
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import NotMine
+from gnd.fleet_bus.seals import Holder
 from gnd.fleet_bus.serving import Request, Serving
 from gnd.gnd_map.tile_id import District
 from gnd.schemas.changes import ChangeAck
@@ -25,7 +26,7 @@ WORKERS: Final = 32  # threads of all of them: acks that come at the same time s
 _LOG = logging.getLogger(__name__)
 
 Place = tuple[str, District]  # layer and district
-Answer = Callable[[str, bytes], ChangeAck]
+Answer = Callable[[str, bytes, Holder | None], ChangeAck]
 
 
 class Reception:
@@ -34,7 +35,7 @@ class Reception:
     Args:
         bus: open.
         members: kept up to date here.
-        answer: takes (key, encoded message) and gives the ack; called from several threads.
+        answer: takes (key, encoded message, who has sealed it) and gives the ack; called from several threads.
         on_death: called with the name of a member that has gone.
     """
 
@@ -72,7 +73,7 @@ class Reception:
                 self._declared.pop(place).close()
 
     def _own(self, request: Request) -> bytes:
-        return self._answer(request.key, request.payload).encode()
+        return self._answer(request.key, request.payload, request.asker).encode()
 
     def _fallback(self, request: Request) -> bytes:
         place = _place(request.key)
@@ -80,7 +81,7 @@ class Reception:
             return self._own(request)  # nobody owns such a key; the answer says why it is refused
         if place in self._declared or not self._members.is_mine(place[1]):
             raise NotMine
-        ack = self._answer(request.key, request.payload)
+        ack = self._answer(request.key, request.payload, request.asker)
         if ack.status != "quarantined":
             self._declare(place)
         return ack.encode()

@@ -12,6 +12,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.cloud_merger.agreement import Agreement, agreement_of
 from gnd.cloud_merger.belief import Believed, ShiftTests, believed
 from gnd.cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate
 from gnd.cloud_merger.memory import (
@@ -31,6 +32,7 @@ from gnd.cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness
 from gnd.gnd_map.codec import Lattice, snap
 from gnd.gnd_map.day import day_of
 from gnd.gnd_map.gaussian import Gaussians
+from gnd.tile_store.values import QUARANTINED, AgreementTest
 
 I32 = NDArray[np.int32]
 
@@ -54,6 +56,7 @@ class MergedWindow:
 
     Attributes:
         believed: its reports, sorted out.
+        agreement: how each agrees with the others, whoever is believed.
         statements: of those that are believed, and of the memory.
         gated: the tile as it may be published, and what waits.
         gaussians: of that tile, on its lattice.
@@ -67,6 +70,7 @@ class MergedWindow:
     gaussians: Gaussians
     parked: ParkedVoxels
     bases: Mapping[bytes, Gaussians]
+    agreement: tuple[AgreementTest, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +82,8 @@ class WindowMerger:
         confirmation: what a single vehicle may change.
         shifts: tests of reports, each made once.
         bases: Gaussians by content hash of the versions that the reports refer to.
-        named: vehicles whose reports are shifted again and again.
+        named: vehicles whose reports are shifted again and again; with `QUARANTINED` before them those whose reports do
+            not count.
         snapping: what the last merges have given, on their lattices.
     """
 
@@ -94,7 +99,9 @@ class WindowMerger:
 
         `lattice`: on which the tile lies; None: none.
         """
-        rules, named = self.rules, self.named
+        rules, agreement = self.rules, Agreement()
+        out = frozenset(name.removeprefix(QUARANTINED) for name in self.named if name.startswith(QUARANTINED))
+        named = frozenset(name for name in self.named if not name.startswith(QUARANTINED))
         if rules.has_paper_rules:  # they know neither shift tests nor a gate nor a memory
             in_play = Believed(tuple(reports), (), ())
             statements = statements_of(state.gaussians, reports, self.bases, rules.mode)
@@ -104,15 +111,20 @@ class WindowMerger:
             in_play = believed(reports, shifts, named)
             statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
             merged = merge_tile(state.gaussians, statements, rules)
+            agreement = agreement_of(state.gaussians, statements, merged.for_epoch)
+            if out & {one.vehicle for one in in_play.reports}:
+                in_play = in_play.without(out)
+                statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
+                merged = merge_tile(state.gaussians, statements, rules)
             by, seen = statements.witnesses, in_play.reports
             standing = state.memory.parked, self.bases, self.confirmation.parked_h
             bare, leaves = hold_season(state.gaussians, merged, seen)
             free = hold_parked(state.gaussians, bare, seen, *standing)
-            found = gate(state.gaussians, free.merged, seen, self.confirmation, named, witnesses=by)
+            found = gate(state.gaussians, free.merged, seen, self.confirmation, named, by, agreement.contradicted)
             gated = GatedTile(found.merged, (*found.waiting, *free.waiting, *leaves, *in_play.set_aside))
             parked = free.voxels
         gaussians = self._on_lattice(gated.merged, reports, lattice)
-        return MergedWindow(in_play, statements, gated, gaussians, parked, self.bases)
+        return MergedWindow(in_play, statements, gated, gaussians, parked, self.bases, agreement.tests)
 
     def _on_lattice(self, merged: MergedTile, reports: Sequence[Report], lattice: Lattice | None) -> Gaussians:
         if lattice is None:

@@ -21,7 +21,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.schemas.errors import SchemaError
 from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownReports
 from gnd.tile_store.store import Store
-from gnd.tile_store.values import Basis, Claim, Publication, PublishResult, ReportRow, TileWork
+from gnd.tile_store.values import QUARANTINED, Basis, Claim, Publication, PublishResult, ReportRow, TileWork
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -123,7 +123,8 @@ class Worker:
         """Of a tile of the voxel map."""
         tile, config = work.claim.tile, self._config
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
-        named = self._store.shifted_vehicles()
+        out = (QUARANTINED + vehicle for vehicle in self._store.quarantined_vehicles())
+        named = self._store.shifted_vehicles().union(out)
         merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named, self._snapping)
         lattice = lattice_of_tile(work.epoch, epoch, config.codec)
         by_window = reports_by_window(work.reports, config.merge, self._unreadable)
@@ -143,6 +144,7 @@ class Worker:
             voxel_reports=provenance_of(merges),
             waiting=now.gated.waiting,
             shift_tests=tuple(test for one in merges for test in one.believed.tests),
+            agreement_tests=tuple(test for one in merges for test in one.agreement),
             courses=courses_of(one for reports in by_window.values() for one in reports),
             memory=encode_state(tile, closed[-1], state) if closed else None,
         )

@@ -9,6 +9,7 @@ from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.ledger import Ledger, SharesOf
 from gnd.fleet_bus.part import Part
 from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.seals import PUBLISHERS
 from gnd.fleet_bus.serving import Handler, Serving
 from gnd.fleet_bus.subscribing import (
     AliveToken,
@@ -23,6 +24,8 @@ from gnd.fleet_bus.wire import WireBytes
 from gnd.gnd_map.tile_id import TileId
 
 _DEFAULT_RETRY = RetryPolicy()
+CERTIFICATE_S: Final = 5.0
+"""So long a certificate is asked for."""
 PUBLISH_WAIT_S: Final = 10.0
 """So long a notice waits for a lost router to come back."""
 
@@ -43,7 +46,13 @@ def open_bus(config: BusConfig | None = None, ledger: Ledger | None = None, name
         BusConfigError: a rule that protects data is broken.
         PortInUse: an endpoint to listen at is taken.
     """
-    return Bus(Connection.open(config or BusConfig(), ledger, name))
+    bus = Bus(Connection.open(config or BusConfig(), ledger, name))
+    sealing = bus.connection.sealing
+    if sealing is not None:
+        sealing.fetch = lambda key: bus.request(key, b"", kind="control", timeout_s=CERTIFICATE_S)
+        if sealing.own.role in PUBLISHERS:  # vehicles send theirs along
+            bus.serve(sealing.certificate_key, lambda _request: sealing.chain, kind="control")
+    return bus
 
 
 class Bus:

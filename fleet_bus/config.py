@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import zenoh
@@ -50,6 +51,7 @@ class BusConfig:
         open_timeout_s: how long `open_bus` tries to reach a router, s.
         patient: whether `open_bus` returns without a router, too, and looks for one as long as it takes: what is
             declared until then is declared when it is found, requests wait for it.
+        identity: folder with the part's certificate; then what it says is sealed, and what it hears must be.
     """
 
     mode: Literal["client", "router"] = "client"
@@ -59,6 +61,7 @@ class BusConfig:
     lease_ms: int = 0
     open_timeout_s: float = 10.0
     patient: bool = False
+    identity: Path | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in ("client", "router"):

@@ -15,6 +15,7 @@ from gnd.fleet_bus.config import MAX_MESSAGE_BYTES, BusConfig, zenoh_config
 from gnd.fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter, PortInUse
 from gnd.fleet_bus.ledger import Ledger, Share, SharesOf
 from gnd.fleet_bus.pacer import Pacer
+from gnd.fleet_bus.sealing import Sealing
 from gnd.fleet_bus.wire import WireMeter
 from gnd.gnd_map.tile_id import TileId
 
@@ -40,6 +41,7 @@ class Connection:
         self._declarations: list[Declare] = []
         self._opening = threading.RLock()
         self.closed = threading.Event()
+        self.sealing = None if config.identity is None else Sealing.of_folder(config.identity)
         self.meter = WireMeter(config.lease_ms or config.link_profile.lease_ms)
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()

@@ -9,6 +9,7 @@ BusError
 ├── MessageTooLarge     over the limit that every session enforces
 ├── RequestFailed       no answer before the deadline
 │   └── RequestRefused  the other side answered: never
+├── SealError           a message whose seal is missing, does not fit or is of the wrong part
 ├── NotMine, Refused    raised by handlers: what they say to the asker
 └── LedgerError         a ledger file or run folder that cannot be read
 """
@@ -64,6 +65,10 @@ class RequestFailed(BusError):
 
 class RequestRefused(RequestFailed):
     """The handler refused the request for good, so that retrying is useless."""
+
+
+class SealError(BusError):
+    """A message is not sealed, or not by who may say it; a certificate is not one of the authority."""
 
 
 class NotMine(BusError):

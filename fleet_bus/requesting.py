@@ -16,8 +16,8 @@ from typing import Final
 import zenoh
 
 from gnd.fleet_bus.connection import Connection
-from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
-from gnd.fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused
+from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, attachment_bytes, head_bytes
+from gnd.fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused, SealError
 from gnd.fleet_bus.ledger import SharesOf
 from gnd.gnd_map.tile_id import TileId
 
@@ -27,6 +27,8 @@ COUNT_WANTED: Final = b"gnd/end"
 """Attachment of a question about a region whose asker wants that closing reply."""
 REFUSED: Final = "gnd/refused"
 """Encoding of a reply that says: do not ask again."""
+CERTIFICATE_WANTED: Final = "gnd/certificate"
+"""Encoding of a reply that says: ask again at once, with your certificate."""
 FAILED: Final = "gnd/failed"
 """Encoding of a reply that says: the handler failed, ask again."""
 
@@ -70,14 +72,18 @@ class RequestAnswers:
     errors: list[str] = field(default_factory=list)
     refusal: str | None = None
     announced: int | None = None
+    certificate_wanted: bool = False
 
-    def add_error(self, error: zenoh.ReplyError) -> None:
-        """Sorts a reply that is not an answer."""
+    def add_error(self, error: zenoh.ReplyError, *, final: bool = True) -> None:
+        """Sorts a reply that is not an answer; `final`: a refusal is believed."""
         encoding, text = str(error.encoding), error.payload.to_bytes().decode(errors="replace")
         if encoding == END_OF_ANSWERS:
             self.announced = (self.announced or 0) + int(text)
-        elif encoding == REFUSED:
+        elif encoding == REFUSED and final:
             self.refusal = text
+        elif encoding == CERTIFICATE_WANTED:
+            self.certificate_wanted = True
+            self.errors.append(text)
         else:
             self.errors.append(text)
 
@@ -137,12 +143,15 @@ class _Asking:
         Raises:
             RequestFailed, RequestRefused, BusClosed.
         """
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s, with_chain = time.monotonic() + timeout_s, False
         for attempt in itertools.count(1):
             left_s = max(deadline_s - time.monotonic(), 0.001)
-            answers = self._once(min(left_s, retry.attempt_timeout_s), first_only=first_only)
+            answers = self._once(min(left_s, retry.attempt_timeout_s), first_only=first_only, with_chain=with_chain)
             if good(answers):
                 return answers
+            if answers.certificate_wanted and not with_chain:
+                with_chain = True
+                continue
             if answers.refusal is not None:
                 raise RequestRefused(self.key, attempt, f"refused: {answers.refusal}")
             wait_s = retry.wait_s(attempt)
@@ -152,13 +161,20 @@ class _Asking:
                 raise BusClosed(f"the bus was closed while asking {self.key} for the {attempt + 1}th time")
         raise AssertionError("unreachable")
 
-    def _once(self, timeout_s: float, *, first_only: bool) -> RequestAnswers:
+    def _once(self, timeout_s: float, *, first_only: bool, with_chain: bool) -> RequestAnswers:
         connection = self.connection
         connection.check_open()
         if not connection.wait_connected(timeout_s):  # nothing would be sent, so nothing is paced nor booked
             return RequestAnswers(errors=[f"no router at {', '.join(connection.config.connect)}"])
         asked_at_s = time.monotonic()
-        connection.outgoing(self.payload, self.kind, self.tile, head_bytes(self.key, REQUEST_BYTES))
+        attachment, digest = None if first_only else COUNT_WANTED, b""
+        if connection.sealing is not None:
+            sealed = connection.sealing.question(
+                self.key, self.payload, count_wanted=not first_only, with_chain=with_chain
+            )
+            attachment, digest = sealed.attachment, sealed.digest
+        head = head_bytes(self.key, REQUEST_BYTES) + attachment_bytes(attachment)
+        connection.outgoing(self.payload, self.kind, self.tile, head)
         inbox: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
         cancel = zenoh.CancellationToken()
         with connection.sending() as session:
@@ -170,23 +186,23 @@ class _Asking:
                 # Answers pass at once and one by one; the default would hold all back until the last has come.
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK,
-                attachment=None if first_only else COUNT_WANTED,
+                attachment=attachment,
                 priority=_LANE.get(self.kind, zenoh.Priority.DATA),
                 cancellation_token=cancel,
             )
         try:
-            return self._collect(inbox, asked_at_s, first_only=first_only)
+            return self._collect(inbox, asked_at_s, digest, first_only=first_only)
         finally:
             cancel.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub
 
     def _collect(
-        self, inbox: "queue.SimpleQueue[zenoh.Reply | None]", asked_at_s: float, *, first_only: bool
+        self, inbox: "queue.SimpleQueue[zenoh.Reply | None]", asked_at_s: float, digest: bytes, *, first_only: bool
     ) -> RequestAnswers:
         answers = RequestAnswers()
         while (reply := self._receive(inbox)) is not None:
             if reply.ok is None:
                 if reply.err is not None:
-                    answers.add_error(reply.err)
+                    answers.add_error(reply.err, final=self._is_believed_bare())
                 continue
             key, payload = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
             self.connection.incoming(
@@ -194,13 +210,33 @@ class _Asking:
                 _REPLY_KIND.get(self.kind, self.kind),
                 self.tile,
                 self.shares_of,
-                head_bytes=head_bytes(key, REPLY_BYTES),
+                head_bytes=head_bytes(key, REPLY_BYTES) + attachment_bytes(reply.ok.attachment),
                 asked_at_s=asked_at_s,
             )
-            answers.ok.append((key, payload))
-            if first_only:
+            if self._counts(reply.ok, key, payload, digest, answers):
+                answers.ok.append((key, payload))
+            if first_only and (answers.ok or answers.refusal is not None):
                 break
         return answers
+
+    def _is_believed_bare(self) -> bool:
+        """Whether an error without a seal may end the request."""
+        return self.connection.sealing is None or self.connection.sealing.answers_are_bare(self.key)
+
+    def _counts(self, sample: zenoh.Sample, key: str, payload: bytes, digest: bytes, answers: RequestAnswers) -> bool:
+        """Whether an answer is one; notes a refusal, and what has no good seal."""
+        sealing = self.connection.sealing
+        if sealing is None:
+            return True
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        try:
+            if not sealing.check_answer(self.key, key, payload, attachment, digest):
+                return True
+            answers.refusal = payload.decode(errors="replace")
+        except SealError as error:
+            sealing.note_refused(self.key, error)
+            answers.errors.append(str(error))
+        return False
 
     def _receive(self, inbox: "queue.SimpleQueue[zenoh.Reply | None]") -> zenoh.Reply | None:
         while True:

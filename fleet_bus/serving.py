@@ -9,10 +9,12 @@ import zenoh
 
 from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
-from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
-from gnd.fleet_bus.errors import BusClosed, BusError, NotMine, Refused
+from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, attachment_bytes, head_bytes
+from gnd.fleet_bus.errors import BusClosed, BusError, NotMine, Refused, SealError
 from gnd.fleet_bus.part import Part
-from gnd.fleet_bus.requesting import COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED
+from gnd.fleet_bus.requesting import CERTIFICATE_WANTED, COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED
+from gnd.fleet_bus.sealing import CertificateWanted
+from gnd.fleet_bus.seals import MARK, Holder, nonce_of, question_digest, wants_count
 from gnd.fleet_bus.workers import Workers
 
 _LOG = logging.getLogger(__name__)
@@ -20,10 +22,14 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request as its handler sees it: the key expression that was asked, and the payload."""
+    """A request as its handler sees it: the key expression that was asked, and the payload.
+
+    `asker` is who has sealed it, where seals are demanded and it matters who asks; else None.
+    """
 
     key: str
     payload: bytes
+    asker: Holder | None = None
 
     @property
     def is_wild(self) -> bool:
@@ -97,8 +103,8 @@ class Serving(Part):
                 self._reply(query)
             except (NotMine, BusClosed):
                 pass  # no reply: another handler gives it, or the asker tries again
-            except Refused as refusal:
-                query.reply_err(str(refusal), encoding=REFUSED)
+            except CertificateWanted as error:
+                query.reply_err(str(error), encoding=CERTIFICATE_WANTED)
             except zenoh.ZError as error:
                 _LOG.warning("%s: cannot reply: %s", query.key_expr, error)
             except Exception as error:
@@ -106,24 +112,55 @@ class Serving(Part):
                 query.reply_err(f"{type(error).__name__}: {error}", encoding=FAILED)
 
     def _reply(self, query: zenoh.Query) -> None:
-        request = Request(str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b"")
-        head = head_bytes(request.key, REQUEST_BYTES)
-        self._connection.incoming(request.payload, self._kind, None, head_bytes=head)
-        answer = self._handler(request)
+        key, payload = str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b""
+        attachment = query.attachment.to_bytes() if query.attachment is not None else b""
+        head = head_bytes(key, REQUEST_BYTES) + attachment_bytes(query.attachment)
+        self._connection.incoming(payload, self._kind, None, head_bytes=head)
+        asker, digest = None, b""
+        sealing = self._connection.sealing
+        if sealing is not None:
+            try:
+                asker, digest = sealing.check_question(key, payload, attachment)
+            except CertificateWanted:
+                raise
+            except SealError as error:
+                sealing.note_refused(key, error)
+                self._refuse(query, key, str(error), question_digest(key, payload, nonce_of(attachment)), attachment)
+                return
+        request = Request(key, payload, asker)
+        try:
+            answer = self._handler(request)
+        except Refused as refusal:
+            self._refuse(query, key, str(refusal), digest, attachment)
+            return
         if isinstance(answer, bytes):
-            self._send(query, request.key, answer)
+            self._send(query, request.key, answer, digest)
             return
         count = 0
         for count, (key, payload) in enumerate(answer, start=1):  # noqa: B007 - the last count is sent below
-            self._send(query, key, payload)
+            self._send(query, key, payload, digest)
             self._connection.closed.wait(len(payload) / REGION_BYTE_S)
         # To a program that knows only zenoh an error would mean that its question had failed.
-        if query.attachment is not None and query.attachment.to_bytes() == COUNT_WANTED:
+        if attachment == COUNT_WANTED or wants_count(attachment):
             query.reply_err(str(count), encoding=END_OF_ANSWERS)
 
-    def _send(self, query: zenoh.Query, key: str, payload: bytes) -> None:
+    def _refuse(self, query: zenoh.Query, key: str, why: str, digest: bytes, attachment: bytes) -> None:
+        """Say that there will be no answer, sealed to who looks at seals."""
+        sealing = self._connection.sealing
+        if sealing is None or "*" in key or not attachment.startswith(MARK):
+            query.reply_err(why, encoding=REFUSED)
+            return
+        payload = why.encode()
+        seal = sealing.answer(key, payload, digest, refusal=True)
+        self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES) + attachment_bytes(seal))
+        with self._connection.sending():
+            query.reply(key, payload, attachment=seal)
+
+    def _send(self, query: zenoh.Query, key: str, payload: bytes, digest: bytes) -> None:
         if "*" in key:
             raise BusError(f"an answer needs a key without wildcards, got {key}: give (key, payload) pairs")
-        self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES))
+        sealing = self._connection.sealing
+        seal = None if sealing is None else sealing.answer(key, payload, digest)
+        self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES) + attachment_bytes(seal))
         with self._connection.sending():
-            query.reply(key, payload)
+            query.reply(key, payload, attachment=seal)

@@ -9,8 +9,8 @@ from zenoh import ext
 
 from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
-from gnd.fleet_bus.envelopes import NOTICE_BYTES, head_bytes
-from gnd.fleet_bus.errors import BusClosed, NoRouter
+from gnd.fleet_bus.envelopes import NOTICE_BYTES, attachment_bytes, head_bytes
+from gnd.fleet_bus.errors import BusClosed, NoRouter, RequestFailed, SealError
 from gnd.fleet_bus.part import Part
 from gnd.fleet_bus.workers import Workers
 from gnd.gnd_map.tile_id import TileId
@@ -60,11 +60,25 @@ class Subscription(Part):
     def _deliver(self, sample: zenoh.Sample) -> None:
         key, payload = str(sample.key_expr), sample.payload.to_bytes()
         try:
-            head = head_bytes(key, NOTICE_BYTES)
+            head = head_bytes(key, NOTICE_BYTES) + attachment_bytes(sample.attachment)
             self._connection.incoming(payload, self._kind, self._tile_of(key), head_bytes=head)
         except BusClosed:
             return
+        if self._connection.sealing is not None and not self._counts(sample, key, payload):
+            return
         self._callback(key, payload)
+
+    def _counts(self, sample: zenoh.Sample, key: str, payload: bytes) -> bool:
+        """Whether a notice has the seal that is demanded."""
+        sealing = self._connection.sealing
+        try:
+            if sealing is not None:
+                sealing.check_notice(key, payload, b"" if sample.attachment is None else sample.attachment.to_bytes())
+        except (SealError, RequestFailed, BusClosed) as error:
+            if sealing is not None:
+                sealing.note_refused(key, error)
+            return False
+        return True
 
 
 class AliveWatch(Part):
@@ -129,9 +143,11 @@ class RecallingPublisher(Part):
         """
         if self.declared is None:
             raise NoRouter(f"no router until now: {len(payload)} bytes for {self._key} were not published")
-        self._connection.outgoing(payload, self._kind, tile, head_bytes(self._key, NOTICE_BYTES))
+        seal = seal_of_notice(self._connection, self._key, payload)
+        head = head_bytes(self._key, NOTICE_BYTES) + attachment_bytes(seal)
+        self._connection.outgoing(payload, self._kind, tile, head)
         with self._connection.sending():
-            self.declared.put(payload)
+            self.declared.put(payload, attachment=seal)
 
     def _end(self) -> None:
         self.undeclare()
@@ -146,9 +162,17 @@ def publish(
     if not connection.wait_connected(wait_s):
         where = ", ".join(connection.config.connect)
         raise NoRouter(f"no router at {where} for {wait_s:g} s: {len(payload)} bytes for {key} were not published")
-    connection.outgoing(payload, kind, tile, head_bytes(key, NOTICE_BYTES))
+    seal = seal_of_notice(connection, key, payload)
+    connection.outgoing(payload, kind, tile, head_bytes(key, NOTICE_BYTES) + attachment_bytes(seal))
     with connection.sending() as session:
-        session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK, priority=NOTICE_LANE)
+        session.put(
+            key, payload, attachment=seal, congestion_control=zenoh.CongestionControl.BLOCK, priority=NOTICE_LANE
+        )
+
+
+def seal_of_notice(connection: Connection, key: str, payload: bytes) -> bytes | None:
+    """The seal of a notice; None without an identity."""
+    return None if connection.sealing is None else connection.sealing.notice(key, payload)
 
 
 def _declare(session: zenoh.Session, keyexpr: str, accept: Callable[[zenoh.Sample], Any], *, history: bool) -> Any:

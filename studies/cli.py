@@ -44,6 +44,7 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "studies.modified_study.study:modified",
         "Which voxels are modified: trees and thresholds, in places and by sensors that nothing was fitted on.",
     ),
+    "trust": ("studies.trust_study.study:trust", "What bad vehicles can do to the map, and who is named for it."),
     "errors": ("studies.simulation.losses:errors", "Which voxels of a simulation cost F1, and why."),
     "real-localisation": (
         "studies.real_localisation.study:real_localisation",

@@ -28,7 +28,7 @@ TURNED_SIGMAS: Final = 4.0
 def put_courses(c: apsw.Connection, layer: str, tile: TileId, courses: Iterable[CourseSaid]) -> None:
     """Enter what the reports of a tile say of their vehicles' courses."""
     all_said, place = list(courses), {"layer": layer, "tile": tile.morton}
-    wanted = place | _ids(said.report_id for said in all_said)
+    wanted = place | ids_of(said.report_id for said in all_said)
     before = {report_id for (report_id,) in fetch(c, "courses_of_tile", wanted)}
     for said in all_said:
         if said.report_id in before:
@@ -43,7 +43,7 @@ def put_tests(c: apsw.Connection, layer: str, tile: TileId, tests: Iterable[Shif
     """
     made, vehicles = list(tests), set()
     place = {"layer": layer, "tile": tile.morton}
-    before: dict[str, int] = dict(fetch(c, "shift_tests_of_tile", place | _ids(one.report_id for one in made)))
+    before: dict[str, int] = dict(fetch(c, "shift_tests_of_tile", place | ids_of(one.report_id for one in made)))
     for test in made:
         if before.get(test.report_id) == int(test.is_explained):
             continue  # a tile's tests come with each of its merges
@@ -93,7 +93,7 @@ def account(c: apsw.Connection, vehicle: str) -> VehicleAccount:
     )
 
 
-def _ids(report_ids: Iterable[str]) -> dict[str, str]:
+def ids_of(report_ids: Iterable[str]) -> dict[str, str]:
     """Some report ids as a statement takes them."""
     return {"ids": json.dumps(list(report_ids))}
 

@@ -19,6 +19,7 @@ from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_journal as journal
 from gnd.tile_store import sqlite_refuted as refuted
 from gnd.tile_store import sqlite_roads as roads
+from gnd.tile_store import sqlite_trust as trust
 from gnd.tile_store import sqlite_uploads as uploads
 from gnd.tile_store import sqlite_versions as versions
 from gnd.tile_store.backup import copy_store
@@ -55,6 +56,7 @@ from gnd.tile_store.values import (
     TileSetAside,
     TileWork,
     VehicleAccount,
+    VehicleTrust,
     VersionInfo,
     VersionKind,
     WaitingChange,
@@ -458,6 +460,24 @@ class SqliteStore:
         """See `Store.shifted_vehicles`."""
         with self._readers.snapshot() as c:
             return accounts.shifted_vehicles(c)
+
+    def quarantined_vehicles(self) -> frozenset[str]:
+        """See `Store.quarantined_vehicles`."""
+        with self._readers.snapshot() as c:
+            return frozenset(one.vehicle for one in trust.quarantined(c))
+
+    def vehicle_trusts(self) -> list[VehicleTrust]:
+        """See `Store.vehicle_trusts`."""
+        with self._readers.snapshot() as c:
+            return trust.trusts(c)
+
+    def quarantine_vehicle(self, vehicle: str, why: str) -> None:
+        """See `Store.quarantine_vehicle`."""
+        self._writer.run(lambda c: trust.quarantine(c, vehicle, why, self._timing()))
+
+    def release_vehicle(self, vehicle: str) -> bool:
+        """See `Store.release_vehicle`."""
+        return self._writer.run(lambda c: trust.release(c, vehicle, self._timing()))
 
     def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
         """See `Store.refuted_reports`."""

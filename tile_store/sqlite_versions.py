@@ -12,6 +12,7 @@ from gnd.tile_store import sqlite_confirmation as confirmation
 from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_journal as journal
 from gnd.tile_store import sqlite_refuted as refuted
+from gnd.tile_store import sqlite_trust as trust
 from gnd.tile_store.errors import StoreError, UnknownReports, UnknownVersion
 from gnd.tile_store.provenance import NOTHING, Provenance, encode_provenance
 from gnd.tile_store.sqlite_connection import change, fetch
@@ -72,6 +73,7 @@ def _put_tests(c: apsw.Connection, publication: Publication, timing: dict[str, A
     vehicles = {test.vehicle for test in tests} if is_feature_layer(claim.layer) else set()
     before = refuted.refuted(c, claim.layer, vehicles)
     accounts.put_tests(c, claim.layer, claim.tile, tests, timing)
+    trust.put_tests(c, claim.layer, claim.tile, publication.agreement_tests, timing)
     refuted.merge_again(c, claim.layer, before, refuted.refuted(c, claim.layer, vehicles), timing)
 
 

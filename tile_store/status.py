@@ -28,6 +28,8 @@ WORDS: Final[dict[WaitingReason, str]] = {
     "named": "its reports are shifted again and again",
     "parked": "the shape of a vehicle, and has not stood for long",
     "season": "leaves of a tree that stayed",
+    "contradicted": "others contradict most of what it claims there",
+    "quarantined": "its reports do not count (`gnd vehicles why`)",
 }
 
 DOUBTED: Final = ("doubtful", "shift")

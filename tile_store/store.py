@@ -32,6 +32,7 @@ from gnd.tile_store.values import (
     TileSetAside,
     TileWork,
     VehicleAccount,
+    VehicleTrust,
     VersionInfo,
     VersionKind,
     WaitingChange,
@@ -229,6 +230,20 @@ class Store(Protocol):
         """The vehicles whose reports are explained by shifts again and again. When one comes or goes, all tiles that it
         has reported about wait to be merged again.
         """
+
+    def quarantined_vehicles(self) -> frozenset[str]:
+        """The vehicles whose reports do not count. When one comes or goes, all tiles that it has reported about wait to
+        be merged again.
+        """
+
+    def vehicle_trusts(self) -> list[VehicleTrust]:
+        """What is known of the word of each vehicle that others could judge, or that is quarantined, by vehicle."""
+
+    def quarantine_vehicle(self, vehicle: str, why: str) -> None:
+        """Let a vehicle's reports count no more, until `release_vehicle`."""
+
+    def release_vehicle(self, vehicle: str) -> bool:
+        """Let a vehicle's reports count again, and pardon what was held against it; False: it was not quarantined."""
 
     def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
         """The reports of some vehicles about a layer that others contradict in most tiles, and whose each is. When one

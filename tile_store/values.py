@@ -21,7 +21,11 @@ from gnd.tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
-WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named", "parked", "season"]
+WaitingReason = Literal[
+    "share", "isolated", "poses", "doubtful", "shift", "named", "parked", "season", "contradicted", "quarantined"
+]
+QUARANTINED: Final = "!"
+"""Before the name of a vehicle among those named: its reports do not count at all."""
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -429,7 +433,9 @@ class Unconfirmed:
         reason: "share": too large a share; "isolated": little, but nothing beside it has come or gone; "poses": of
             reports with poor poses only; "doubtful": the vehicle doubts it itself; "shift": a shift of its poses
             explains it; "named": its reports are shifted again and again; "parked": it has the shape of a vehicle
-            and has not stood for long, whoever saw it; "season": it came or went in the crown of a tree that stayed.
+            and has not stood for long, whoever saw it; "season": it came or went in the crown of a tree that stayed;
+            "contradicted": others contradict most of what the vehicle claims there;
+            "quarantined": of a vehicle whose reports do not count.
     """
 
     vehicle: str
@@ -462,6 +468,62 @@ class ShiftTest:
     turn_rad: float
     forward_m: float | None = None
     left_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AgreementTest:
+    """How a report's statements about a tile agree with those of others within the same half hour.
+
+    Attributes:
+        report_id: the report.
+        vehicle: who made it.
+        at_ns: time of its last scan, UTC.
+        claims: changes that it claims and others can judge, ...
+        refuted_claims: ... of which so many are contradicted.
+        quotes: voxels that are as they were, by its word, and that others can judge, ...
+        refuted_quotes: ... of which so many have changed by theirs.
+        is_refuted: it is contradicted as a whole.
+    """
+
+    report_id: str
+    vehicle: str
+    at_ns: int
+    claims: int
+    refuted_claims: int
+    quotes: int
+    refuted_quotes: int
+    is_refuted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleTrust:
+    """What is known of a vehicle's word.
+
+    Attributes:
+        vehicle: its pseudonym.
+        tested: of its newest tiles so many were judged by others, ...
+        refuted: ... and it was contradicted in so many.
+        claims: changes that it claimed there, ...
+        refuted_claims: ... and how many of them were contradicted.
+        quotes: voxels that it called unchanged, ...
+        refuted_quotes: ... and how many of them had changed.
+        is_quarantined: its reports do not count.
+        by: "agreement" or "operator"; "": it is not quarantined.
+        why: reason in a line.
+        since_ns: when it was quarantined, UTC; 0: it is not.
+    """
+
+    vehicle: str
+    tested: int
+    refuted: int
+    claims: int
+    refuted_claims: int
+    quotes: int
+    refuted_quotes: int
+    is_quarantined: bool
+    by: str = ""
+    why: str = ""
+    since_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -537,10 +599,10 @@ class Publication:
     """A merge's result: the new content, or None when nothing visible has changed.
 
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
-    each changed feature, when known. `waiting` is what the reports claim and the content has not;
-    None: as before. `shift_tests` and `courses` are those of this tile's reports, which add to the accounts
-    of their vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have
-    come to, where any was folded.
+    each changed feature, when known. `waiting` is what the reports claim and the content has not; None: as before.
+    `shift_tests`, `agreement_tests` and `courses` are those of this tile's reports, which add to the accounts of their
+    vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have come to,
+    where any was folded.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -552,6 +614,7 @@ class Publication:
     voxel_reports: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     waiting: tuple[Unconfirmed, ...] | None = None
     shift_tests: tuple[ShiftTest, ...] = ()
+    agreement_tests: tuple[AgreementTest, ...] = ()
     courses: tuple[CourseSaid, ...] = ()
     basis: Basis | None = None
     memory: StoredMemory | None = None

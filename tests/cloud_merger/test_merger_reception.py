@@ -32,7 +32,7 @@ def shard(cloud):
     """Shard "one", which stores nothing: it acknowledges all, and refuses reports of the last tile's district."""
     died = []
 
-    def answer(_key, payload):
+    def answer(_key, payload, _asker=None):
         report = ChangeReport.decode(payload)
         is_bad = report.district == TILES[-1].district
         return ChangeAck(report.report_id, "quarantined" if is_bad else "stored", "bad" if is_bad else "")

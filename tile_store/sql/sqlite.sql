@@ -335,6 +335,44 @@ ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
 -- name: shifted_vehicles
 SELECT vehicle FROM shifted_vehicle ORDER BY vehicle
 
+-- name: agreement_tests_of_tile
+SELECT report_id, claims, refuted_claims, quotes, refuted_quotes, refuted FROM agreement_test
+WHERE layer = :layer AND tile = :tile AND report_id IN (SELECT value FROM json_each(:ids))
+
+-- name: put_agreement_test
+INSERT INTO agreement_test
+  (layer, tile, report_id, vehicle, at_ns, claims, refuted_claims, quotes, refuted_quotes, refuted)
+VALUES
+  (:layer, :tile, :report_id, :vehicle, :at_ns, :claims, :refuted_claims, :quotes, :refuted_quotes, :refuted)
+ON CONFLICT (layer, tile, report_id) DO UPDATE
+SET claims = excluded.claims, refuted_claims = excluded.refuted_claims, quotes = excluded.quotes,
+    refuted_quotes = excluded.refuted_quotes, refuted = excluded.refuted
+
+-- name: agreement_tests_of_vehicle
+SELECT MAX(at_ns), claims, refuted_claims, quotes, refuted_quotes, refuted FROM agreement_test
+WHERE vehicle = :vehicle AND at_ns > COALESCE((SELECT until_ns FROM pardon WHERE vehicle = :vehicle), -1)
+GROUP BY layer, tile ORDER BY MAX(at_ns) DESC, layer, tile LIMIT :n
+
+-- name: newest_agreement_test
+SELECT COALESCE(MAX(at_ns), 0) FROM agreement_test WHERE vehicle = :vehicle
+
+-- name: judged_vehicles
+SELECT vehicle FROM agreement_test UNION SELECT vehicle FROM quarantined_vehicle ORDER BY vehicle
+
+-- name: quarantined_vehicles
+SELECT vehicle, since_ns, source, why FROM quarantined_vehicle ORDER BY vehicle
+
+-- name: quarantine_vehicle
+INSERT INTO quarantined_vehicle (vehicle, since_ns, source, why) VALUES (:vehicle, :since_ns, :source, :why)
+ON CONFLICT (vehicle) DO UPDATE SET source = excluded.source, why = excluded.why WHERE excluded.source = 'operator'
+
+-- name: release_vehicle
+DELETE FROM quarantined_vehicle WHERE vehicle = :vehicle AND (source = 'agreement' OR :any)
+
+-- name: pardon_vehicle
+INSERT INTO pardon (vehicle, until_ns) VALUES (:vehicle, :until_ns)
+ON CONFLICT (vehicle) DO UPDATE SET until_ns = excluded.until_ns
+
 -- name: refuted_reports
 SELECT report_id FROM shift_test WHERE vehicle = :vehicle AND layer = :layer
 GROUP BY report_id HAVING SUM(explained) >= :least AND SUM(explained) >= :share * COUNT(*)
@@ -898,3 +936,30 @@ ON CONFLICT (layer, tile) DO UPDATE SET state = excluded.state, reason = exclude
 
 -- name: waits_to_be_merged
 SELECT 1 FROM dirty WHERE layer = :layer AND tile = :tile
+
+-- name: schema_of_trust
+-- How reports agree with those of others; who does not count any more, and what was pardoned.
+CREATE TABLE IF NOT EXISTS agreement_test (
+  layer          TEXT    NOT NULL,
+  tile           INTEGER NOT NULL,
+  report_id      TEXT    NOT NULL,
+  vehicle        TEXT    NOT NULL,
+  at_ns          INTEGER NOT NULL,
+  claims         INTEGER NOT NULL,
+  refuted_claims INTEGER NOT NULL,
+  quotes         INTEGER NOT NULL,
+  refuted_quotes INTEGER NOT NULL,
+  refuted        INTEGER NOT NULL CHECK (refuted IN (0, 1)),
+  PRIMARY KEY (layer, tile, report_id)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS agreement_test_vehicle ON agreement_test (vehicle, at_ns);
+CREATE TABLE IF NOT EXISTS quarantined_vehicle (
+  vehicle  TEXT    NOT NULL PRIMARY KEY,
+  since_ns INTEGER NOT NULL,
+  source   TEXT    NOT NULL CHECK (source IN ('agreement', 'operator')),
+  why      TEXT    NOT NULL
+) STRICT, WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS pardon (
+  vehicle  TEXT    NOT NULL PRIMARY KEY,
+  until_ns INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;

@@ -1,0 +1,155 @@
+"""How what each report says of a tile agrees with what others saw within the same half hour.
+
+A vehicle whose statements are contradicted by two or more others, nearly all of them and in tile after tile, is wrong:
+its LiDAR is mounted otherwise than it believes, its poses are bad, or it lies. No truth is needed for that, and no
+vehicle is its own witness. Single contradictions are normal: things move, and are seen from one side only.
+
+A function of the window's reports alone, not of who is believed: so who is named depends on the journal, in any order.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd.cloud_merger.statements import Kind, Report, Statements
+from gnd.gnd_map.arrays import are_in
+from gnd.gnd_map.foliage import follows_season
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.vehicle_shape import has_vehicle_shape
+from gnd.tile_store.values import AgreementTest
+
+JUDGED_VOXELS: Final = 12
+"""Fewer statements that others can judge say nothing about a report."""
+REFUTED_CLAIMS: Final = 0.6
+"""A report is refuted where others contradict this share of the changes that it claims, ..."""
+REFUTED_QUOTES: Final = 0.8
+"""... or this share of what it says is as it was, where they say that it has changed: that is missed more easily."""
+DENIED_CLAIM: Final = 2
+DENIED_QUOTE: Final = 3
+"""So many others must contradict a statement, and more than agree with it. Of a claim those who came later count: what
+has just changed is contradicted by nobody who came before. Of "as it was" those count who came earlier."""
+CONTRADICTED_VOXELS: Final = 8
+CONTRADICTED_SHARE: Final = 0.5
+"""Who is contradicted in so many voxels of a tile, and in this share of what others can judge, is not believed alone
+there: of two vehicles that say the opposite nobody knows who is right."""
+
+Mask = NDArray[np.bool_]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Agreement:
+    """What the reports of a window say about each other.
+
+    Attributes:
+        tests: of each report that others can judge.
+        contradicted: the vehicles that are not believed alone in this tile.
+    """
+
+    tests: tuple[AgreementTest, ...] = ()
+    contradicted: frozenset[str] = frozenset()
+
+
+def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> Agreement:
+    """How the reports of a window agree.
+
+    Args:
+        epoch: the tile that the reports are merged into.
+        statements: of all reports of the window, believed or not.
+        for_epoch: (M,) which of them say that a voxel is as in the epoch.
+    """
+    reports, rows = statements.reports, statements.rows
+    if len({one.vehicle for one in reports}) < 2 or not len(for_epoch):
+        return Agreement()
+    told = np.flatnonzero((rows["report"] >= 0) & (rows["report"] < len(reports)))
+    time_ns = np.array([one.last_ns for one in reports], np.int64)[rows["report"][told]]
+    told = told[np.lexsort((rows["report"][told], time_ns, rows["voxel_id"][told]))]
+    rows, quotes = rows[told], for_epoch[told] & ~rows["claim"][told]
+    claim = rows["claim"]
+    gone, there = claim & (rows["kind"] == Kind.NOTHING), claim & (rows["kind"] != Kind.NOTHING)
+    (gone_before, gone_after), (there_before, there_after), (quotes_before, quotes_after) = (
+        _around(rows["voxel_id"], which) for which in (gone, there, quotes)
+    )
+    contradicted = _contradicted(
+        reports,
+        rows["report"],
+        claim,
+        np.where(gone, gone_before + gone_after, there_before + there_after),
+        quotes_before + quotes_after,
+    )
+    agree = np.where(gone, gone_after, np.where(there, there_after, quotes_before))
+    deny = np.where(claim, quotes_after, np.maximum(gone_before, there_before))
+    least = np.where(claim, DENIED_CLAIM, DENIED_QUOTE)
+    judged = (agree + deny >= least) & (claim | quotes)
+    refuted = judged & (deny >= least) & (deny > agree)
+    tests = []
+    for number, report in enumerate(reports):
+        own = rows["report"] == number
+        tests.append(_test_of(report, rows["voxel_id"], own & judged, own & refuted, claim, epoch))
+    return Agreement(tuple(one for one in tests if one is not None), contradicted)
+
+
+def _around(voxel_id: NDArray[np.int32], which: Mask) -> tuple[I64, I64]:
+    """(M,) how many rows of `which` come before and behind each row in its voxel; `voxel_id` is sorted."""
+    first = np.append(True, voxel_id[1:] != voxel_id[:-1])[: len(voxel_id)]
+    group = np.cumsum(first) - 1
+    until = np.cumsum(which)
+    start = (until - which)[first][group]
+    total = np.bincount(group, weights=which).astype(np.int64)[group]
+    before = until - which - start
+    return before, total - before - which
+
+
+def _contradicted(
+    reports: Sequence[Report], report: NDArray[np.int32], claim: Mask, agree: I64, deny: I64
+) -> frozenset[str]:
+    """Vehicles of whose claims others deny many; somebody else must have seen the voxel."""
+    judged, denied = claim & (agree + deny > 0), claim & (deny > agree)
+    n_judged = np.bincount(report[judged], minlength=len(reports))
+    n_denied = np.bincount(report[denied], minlength=len(reports))
+    found = (n_denied >= CONTRADICTED_VOXELS) & (n_denied >= CONTRADICTED_SHARE * n_judged)
+    return frozenset(one.vehicle for one, is_found in zip(reports, found, strict=True) if is_found and one.vehicle)
+
+
+def _test_of(
+    report: Report, voxel_id: NDArray[np.int32], judged: Mask, refuted: Mask, claim: Mask, epoch: Gaussians
+) -> AgreementTest | None:
+    claims, quotes = int((judged & claim).sum()), int((judged & ~claim).sum())
+    if max(claims, quotes) < JUDGED_VOXELS:
+        return None
+    wrong_claims, wrong_quotes = int((refuted & claim).sum()), int((refuted & ~claim).sum())
+    by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
+    if by_claims:  # what parks and leaves that come differ from drive to drive, and are nobody's fault
+        lasting = ~are_in(voxel_id, _passing(report, voxel_id[judged & claim], epoch))
+        claims, wrong_claims = int((judged & claim & lasting).sum()), int((refuted & claim & lasting).sum())
+        by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
+    by_quotes = quotes >= JUDGED_VOXELS and wrong_quotes >= REFUTED_QUOTES * quotes
+    return AgreementTest(
+        report_id=report.report_id,
+        vehicle=report.vehicle,
+        at_ns=report.last_ns,
+        claims=claims,
+        refuted_claims=wrong_claims,
+        quotes=quotes,
+        refuted_quotes=wrong_quotes,
+        is_refuted=by_claims or by_quotes,
+    )
+
+
+def _passing(report: Report, claimed: NDArray[np.int32], epoch: Gaussians) -> NDArray[np.int32]:
+    """Voxels of a report's claims that have the shape of a standing vehicle, come or gone, or follow the season."""
+    grid, changed = VoxelGrid.of(report.change.tile), report.change.changed
+    come = changed.take(changed.exists & ~are_in(changed.voxel_id, epoch.voxel_id))
+    left = np.intersect1d(changed.voxel_id[~changed.exists], epoch.voxel_id).astype(np.int32)
+    stood = epoch.take(are_in(epoch.voxel_id, left))
+    rest = epoch.take(~are_in(epoch.voxel_id, left))
+    found = [
+        come.voxel_id[has_vehicle_shape(grid, epoch, come)],
+        stood.voxel_id[has_vehicle_shape(grid, rest, stood)],
+        follows_season(grid, epoch, left, come),
+    ]
+    return np.intersect1d(np.concatenate(found), claimed).astype(np.int32)

@@ -1,0 +1,93 @@
+"""Whose word counts, in SQLite: each function runs inside the caller's transaction."""
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+import apsw
+
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.sqlite_accounts import NEWEST_TESTS, ids_of
+from gnd.tile_store.sqlite_connection import change, fetch
+from gnd.tile_store.sqlite_inbox import merge_again
+from gnd.tile_store.values import AgreementTest, VehicleTrust
+
+REFUTED_TILES: Final = 3
+"""A vehicle does not count any more when others have contradicted it in so many tiles, ..."""
+REFUTED_SHARE: Final = 0.5
+"""... if they are so many of all in which they could."""
+
+
+def put_tests(
+    c: apsw.Connection, layer: str, tile: TileId, tests: Iterable[AgreementTest], timing: dict[str, Any]
+) -> None:
+    """Enter the tests of a tile. Where that puts a vehicle into quarantine, or lets it out, all tiles that it has
+    reported about are merged again.
+    """
+    made, vehicles = list(tests), set()
+    place = {"layer": layer, "tile": tile.morton}
+    before = {row[0]: row[1:] for row in fetch(c, "agreement_tests_of_tile", place | ids_of(t.report_id for t in made))}
+    for test in made:
+        told = {name: getattr(test, name) for name in AgreementTest.__slots__ if name != "is_refuted"}
+        told["refuted"] = int(test.is_refuted)
+        now = tuple(told[name] for name in ("claims", "refuted_claims", "quotes", "refuted_quotes", "refuted"))
+        if before.get(test.report_id) == now:
+            continue  # a tile's tests come with each of its merges
+        change(c, "put_agreement_test", told | place)
+        vehicles.add(test.vehicle)
+    known = {one.vehicle: one for one in quarantined(c)} if vehicles else {}
+    for vehicle in sorted(vehicles):
+        found = trust_of(c, vehicle)
+        is_bad = found.refuted >= REFUTED_TILES and found.refuted >= REFUTED_SHARE * found.tested
+        if is_bad and vehicle not in known:
+            why = f"others contradict it in {found.refuted} of {found.tested} tiles"
+            told = {"vehicle": vehicle, "since_ns": timing["now"], "source": "agreement", "why": why}
+            change(c, "quarantine_vehicle", told)
+            _merge_its_tiles_again(c, vehicle, timing)
+        elif not is_bad and vehicle in known and change(c, "release_vehicle", {"vehicle": vehicle, "any": 0}):
+            _merge_its_tiles_again(c, vehicle, timing)
+
+
+def quarantined(c: apsw.Connection) -> list[VehicleTrust]:
+    """The vehicles whose reports do not count."""
+    return [
+        VehicleTrust(vehicle, 0, 0, 0, 0, 0, 0, True, source, why, since_ns)
+        for vehicle, since_ns, source, why in fetch(c, "quarantined_vehicles")
+    ]
+
+
+def trust_of(c: apsw.Connection, vehicle: str) -> VehicleTrust:
+    """What the newest tests of a vehicle say, tile by tile, and whether it is quarantined."""
+    rows = fetch(c, "agreement_tests_of_vehicle", {"vehicle": vehicle, "n": NEWEST_TESTS})
+    sums = [sum(row[column] for row in rows) for column in range(1, 5)]
+    state = next((one for one in quarantined(c) if one.vehicle == vehicle), None)
+    refuted = sum(1 for row in rows if row[5])
+    if state is None:
+        return VehicleTrust(vehicle, len(rows), refuted, *sums, False)
+    return VehicleTrust(vehicle, len(rows), refuted, *sums, True, state.by, state.why, state.since_ns)
+
+
+def trusts(c: apsw.Connection) -> list[VehicleTrust]:
+    """Of all vehicles that were judged or quarantined, by vehicle."""
+    return [trust_of(c, vehicle) for (vehicle,) in fetch(c, "judged_vehicles")]
+
+
+def quarantine(c: apsw.Connection, vehicle: str, why: str, timing: dict[str, Any]) -> None:
+    """An operator takes a vehicle out, until an operator lets it in again."""
+    told = {"vehicle": vehicle, "since_ns": timing["now"], "source": "operator", "why": why}
+    change(c, "quarantine_vehicle", told)
+    _merge_its_tiles_again(c, vehicle, timing)
+
+
+def release(c: apsw.Connection, vehicle: str, timing: dict[str, Any]) -> bool:
+    """An operator lets a vehicle in again: what was held against it until now is pardoned, its reports count again."""
+    ((newest_ns,),) = fetch(c, "newest_agreement_test", {"vehicle": vehicle})
+    if not change(c, "release_vehicle", {"vehicle": vehicle, "any": 1}):
+        return False
+    change(c, "pardon_vehicle", {"vehicle": vehicle, "until_ns": newest_ns})
+    _merge_its_tiles_again(c, vehicle, timing)
+    return True
+
+
+def _merge_its_tiles_again(c: apsw.Connection, vehicle: str, timing: dict[str, Any]) -> None:
+    for layer, tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
+        merge_again(c, layer, TileId(tile), timing)
