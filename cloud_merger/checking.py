@@ -37,6 +37,12 @@ class IngestLimits:
         least=0,
         most=32,
     )
+    reports_a_minute: float = setting(
+        120.0,
+        "A vehicle may send this many on the average, 600 at once after it was out of reach; beyond it is told to wait.",
+        unit="1/min",
+        above=0,
+    )
 
     def __post_init__(self) -> None:
         check_settings(self, MergerError)
