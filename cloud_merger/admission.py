@@ -154,7 +154,9 @@ class Admission:
             missing_s = self._nonsense.missing_s(1, self._clock_s())
             if missing_s > 0:
                 raise Busy(
-                    f"more than {NONSENSE_A_MINUTE:g} messages a minute that cannot be read", _bounded(missing_s), "nonsense"
+                    f"more than {NONSENSE_A_MINUTE:g} messages a minute that cannot be read",
+                    _bounded(missing_s),
+                    "nonsense",
                 )
             self._nonsense.take(1)
 
@@ -174,7 +176,9 @@ class Admission:
     def _check_all(self, in_all: int, is_known: bool) -> None:
         limit = WAITING_OF_ALL if is_known else WAITING_OF_ALL // 2
         if in_all >= limit:
-            raise Busy(f"{in_all} uploads wait to be looked at, the limit is {limit}", WAITING_RETRY_S, "waiting in all")
+            raise Busy(
+                f"{in_all} uploads wait to be looked at, the limit is {limit}", WAITING_RETRY_S, "waiting in all"
+            )
 
     def _account(self, vehicle: str, now_s: float) -> _Account:
         account = self._accounts.get(vehicle)
@@ -214,7 +218,9 @@ def _check(account: _Account, vehicle: str, size_bytes: int, now_s: float) -> No
         raise Busy(f"{vehicle} has sent too many reports of late", _bounded(missing_s), "reports")
     missing_s = account.size.missing_s(size_bytes, now_s)
     if missing_s > 0:
-        raise Busy(f"{vehicle} has sent too many bytes of late, these {size_bytes} are more", _bounded(missing_s), "bytes")
+        raise Busy(
+            f"{vehicle} has sent too many bytes of late, these {size_bytes} are more", _bounded(missing_s), "bytes"
+        )
 
 
 def _bounded(missing_s: float) -> float:

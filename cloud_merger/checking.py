@@ -39,7 +39,7 @@ class IngestLimits:
     )
     reports_a_minute: float = setting(
         120.0,
-        "A vehicle may send this many on the average, 600 at once after it was out of reach; beyond it is told to wait.",
+        "A vehicle may send this many on the average, 600 at once after it was out of reach; then it has to wait.",
         unit="1/min",
         above=0,
     )

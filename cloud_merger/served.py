@@ -1,7 +1,7 @@
 """CPU that was spent on each vehicle's uploads of late: who has had least comes first.
 
-Names that are new share one account of a quarter of it all, however many they are: else an invented name, on which nothing
-was spent yet, would always come first.
+Names that are new share one account of a quarter of it all, however many they are: else an invented name, on which
+nothing was spent yet, would always come first.
 """
 
 import threading

@@ -154,7 +154,8 @@ class Bus:
             keyexpr: keys that are served.
             handler: gives bytes (one answer on the asked key) or (key, payload) pairs (answers to a region, which are
                 given by one thread of their own, at `serving.REGION_BYTE_S`). It may
-                raise `NotMine` (no reply), `Refused` (never ask again), `Busy` (ask again later); any other exception makes the asker try again.
+                raise `NotMine` (no reply), `Refused` (never ask again), `Busy` (ask again later); any other exception
+                makes the asker try again.
             complete: whether this handler alone answers for all these keys; the router then asks no other.
             workers: number of threads.
             kind: ledger kind of requests and answers.

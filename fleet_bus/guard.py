@@ -161,7 +161,7 @@ class ConnectionGuard:
 
 def _descriptors() -> list[int]:
     try:
-        return [int(name) for name in os.listdir(_FD_FOLDER)]
+        return [int(entry.name) for entry in _FD_FOLDER.iterdir()]
     except OSError:  # not Linux, or no descriptor left
         return []
 

@@ -12,8 +12,8 @@ from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
 from gnd.fleet_bus.errors import BusClosed, BusError, Busy, NotMine, Refused
 from gnd.fleet_bus.part import Part
-from gnd.fleet_bus.requesting import BUSY, COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED, busy_text
 from gnd.fleet_bus.refusals import counted
+from gnd.fleet_bus.requesting import BUSY, COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED, busy_text
 from gnd.fleet_bus.seldom import Seldom
 from gnd.fleet_bus.turns import InTurn
 

@@ -1,8 +1,8 @@
 """A mailbox that serves its senders in turn: who sends much waits for itself, not others for it.
 
-Deficit round robin over the turns (a vehicle, a district) by their bytes, within two groups: turns that have been seen for
-a while, and newcomers. A name costs nothing to invent; so all newcomers together have a share of their own, however many
-they are, and only a name that comes again after `KNOWN_AFTER_S` leaves them.
+Deficit round robin over the turns (a vehicle, a district) by their bytes, within two groups: turns that have been seen
+for a while, and newcomers. A name costs nothing to invent; so all newcomers together have a share of their own, however
+many they are, and only a name that comes again after `KNOWN_AFTER_S` leaves them.
 """
 
 import logging

@@ -44,7 +44,7 @@ def any_claimable(c: apsw.Connection, owner: str) -> bool:
 
 
 def waiting(c: apsw.Connection, vehicle: str | None, at_most: int) -> int:
-    """How many uploads wait, of one vehicle only those that nobody has looked at; no more than `at_most` are counted."""
+    """How many uploads wait, of one vehicle only those that nobody has looked at; at most `at_most` are counted."""
     if vehicle is None:
         return int(fetch(c, "waiting_of_all", {"n": at_most})[0][0])
     return int(fetch(c, "waiting_of_vehicle", {"vehicle": vehicle, "n": at_most})[0][0])

@@ -54,8 +54,9 @@ class Store(Protocol):
     def claim_uploads(
         self, owner: str, n: int, lease_s: float, in_turn: Callable[[list[str]], list[str]] = sorted
     ) -> list[UploadClaim]:
-        """Lease up to `n` uploads that wait: of the vehicles in the order into which `in_turn` brings them ("": Gaussians,
-        which do not tell whose they are), a few of each, its oldest first; one that was claimed before comes alone.
+        """Lease up to `n` uploads that wait: of the vehicles in the order into which `in_turn` brings them ("":
+        Gaussians, which do not tell whose they are), a few of each, its oldest first; one that was claimed before comes
+        alone.
         """
 
     def uploads_waiting(self, vehicle: str | None, at_most: int) -> int:
