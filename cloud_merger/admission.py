@@ -26,8 +26,8 @@ BYTES_A_MINUTE: Final = 16.0 * MIB
 BYTES_AT_ONCE: Final = 64.0 * MIB
 OWNER_VEHICLES: Final = 1_000
 """An owner may send as much as so many vehicles."""
-NAMES_A_MINUTE: Final = 600.0
-NAMES_AT_ONCE: Final = 4_000
+NAMES_A_MINUTE: Final = 1_200.0
+NAMES_AT_ONCE: Final = 2_000
 """New names: after a restart every vehicle is new."""
 REMEMBERED_NAMES: Final = 65_536
 WAITING_OF_VEHICLE: Final = 256

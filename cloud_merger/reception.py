@@ -119,7 +119,7 @@ class Reception:
         return ack.encode()
 
     def look_again(self) -> None:
-        """Believe the tokens of shards that the store has come to know meanwhile, and of none that it no longer does."""
+        """Believe the tokens of shards that the store has come to know meanwhile, of none that it forgot."""
         for member in sorted(self._tokens):
             self._note(member, alive=self._is_shard(member))
 

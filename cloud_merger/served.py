@@ -4,6 +4,7 @@ Names that are new share one account of a quarter of it all, however many they a
 nothing was spent yet, would always come first.
 """
 
+import random
 import threading
 import time
 from collections import OrderedDict
@@ -44,14 +45,16 @@ class ServedCpu:
     def in_turn(self, vehicles: Iterable[str]) -> list[str]:
         """The vehicles in the order in which their uploads are to be looked at."""
         with self._lock:
-            groups: dict[bool, list[tuple[float, str]]] = {True: [], False: []}
+            groups: dict[bool, list[tuple[float, float, str]]] = {True: [], False: []}
             every = list(vehicles)
             for vehicle in every:
                 share = len(every) if not vehicle else 1  # those of all vehicles
-                groups[not vehicle or self._turns.is_known(vehicle)].append((self._faded(vehicle) / share, vehicle))
+                spent_s = self._faded(vehicle) / share
+                group = groups[not vehicle or self._turns.is_known(vehicle)]
+                group.append((spent_s, random.random(), vehicle))  # among equals no name comes first
             known_first = self._faded(_KNOWN) <= KNOWN_SHARE * self._faded(_NEW)
             ordered = sorted(groups[known_first]) + sorted(groups[not known_first])
-        return [vehicle for _, vehicle in ordered]
+        return [vehicle for *_, vehicle in ordered]
 
     def _faded(self, name: str) -> float:
         amount, since_s = self._spent.get(name, (0.0, 0.0))

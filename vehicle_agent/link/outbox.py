@@ -246,7 +246,7 @@ class Outbox:
             _whole(c, report_id, reason)
 
     def failed(self, letter: Letter, now_ns: int, reason: str, least_s: float = 0.0) -> int:
-        """Record a failed attempt; returns when to try again (ns): 0.5 s doubled each time, at most 15 s, but not before
+        """Record a failed attempt; returns when to try again (ns): 0.5 s doubled each time, at most 15 s, not before
         `least_s` are over.
         """
         wait_s = max(min(FIRST_WAIT_S * 2 ** min(letter.attempts, 8), LONGEST_WAIT_S), least_s)

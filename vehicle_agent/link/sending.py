@@ -104,7 +104,7 @@ class SenderThread:
             _log.warning("report %s not acknowledged: %s", letter.report_id, error)
 
     def _failed(self, letter: Letter, error: RequestFailed) -> None:
-        """Where the cloud says that it is busy, nothing else of this vehicle is sent before that time is over either."""
+        """Where the cloud says that it is busy, nothing else of this vehicle is sent before that time is over."""
         wait_s = error.retry_after_s * random.uniform(1.0, BUSY_SPREAD)
         self._outbox.failed(letter, time.monotonic_ns(), str(error), wait_s)
         self.last_error = str(error)
