@@ -118,7 +118,7 @@ def busy_text(retry_after_s: float, why: str) -> str:
 def _busy_of(text: str) -> tuple[float, str]:
     """Seconds to wait and why; of what makes no sense nothing to wait."""
     number, _, why = text.partition(";")
-    is_number = number.isascii() and number.isdigit() and len(number) < 10
+    is_number = number.isascii() and number.isdigit() and len(number) < 19
     return (min(int(number) / 1000, LONGEST_BUSY_S) if is_number else 0.0), why
 
 
