@@ -18,6 +18,8 @@ from gnd.schemas.upload_head import UploadHead
 from gnd.tile_store.uploads import FirstHalf
 
 MIB: Final = 1024 * 1024
+REPORTS_A_MINUTE: Final = 120.0
+"""Of a vehicle, on the average; one that drives sends some ten."""
 REPORTS_AT_ONCE: Final = 600
 """A vehicle that was out of reach may send so many at once, ..."""
 NEWCOMER_REPORTS: Final = 120
@@ -27,7 +29,7 @@ BYTES_AT_ONCE: Final = 64.0 * MIB
 OWNER_VEHICLES: Final = 1_000
 """An owner may send as much as so many vehicles."""
 NAMES_A_MINUTE: Final = 1_200.0
-NAMES_AT_ONCE: Final = 2_000
+NAMES_AT_ONCE: Final = 600
 """New names: after a restart every vehicle is new."""
 REMEMBERED_NAMES: Final = 65_536
 WAITING_OF_VEHICLE: Final = 256
@@ -103,7 +105,7 @@ class Admission:
     def __init__(
         self,
         store: Waiting,
-        reports_a_minute: float,
+        reports_a_minute: float = REPORTS_A_MINUTE,
         owner_of: Callable[[str], str] = lambda _vehicle: "",
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -155,7 +157,7 @@ class Admission:
             if missing_s > 0:
                 raise Busy(
                     f"more than {NONSENSE_A_MINUTE:g} messages a minute that cannot be read",
-                    _bounded(missing_s),
+                    WAITING_RETRY_S,
                     "nonsense",
                 )
             self._nonsense.take(1)
@@ -187,7 +189,7 @@ class Admission:
             return account
         missing_s = self._names.missing_s(1, now_s)
         if missing_s > 0:
-            raise Busy(f"more than {NAMES_A_MINUTE:g} new vehicles a minute", _bounded(missing_s), "names")
+            raise Busy(f"more than {NAMES_A_MINUTE:g} new vehicles a minute", WAITING_RETRY_S, "names")
         self._names.take(1)
         return _kept(self._accounts, vehicle, self._new(now_s, 1, NEWCOMER_REPORTS))
 

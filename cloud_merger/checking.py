@@ -37,12 +37,6 @@ class IngestLimits:
         least=0,
         most=32,
     )
-    reports_a_minute: float = setting(
-        120.0,
-        "A vehicle may send this many on the average, 600 at once after it was out of reach; then it has to wait.",
-        unit="1/min",
-        above=0,
-    )
 
     def __post_init__(self) -> None:
         check_settings(self, MergerError)

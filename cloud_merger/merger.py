@@ -25,7 +25,7 @@ from gnd.cloud_merger.worker_process import Address, worker_process
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.health import HealthServer
-from gnd.fleet_bus.refusals import show_refusals
+from gnd.fleet_bus.refusals import RefusalsTold, show_refusals
 from gnd.tile_store.errors import StoreClosed, StoreError
 from gnd.tile_store.metrics import store_checks
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -65,7 +65,7 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
     ):
         store.release(config.shard_id)  # leases of an earlier life
         with worker_process(config, metrics_at) as worker:
-            admission = Admission(store, config.ingest.reports_a_minute)
+            admission = Admission(store)
             # look at the outside, keep the bytes
             ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission)
             members = Members(config.shard_id)
@@ -73,8 +73,10 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
             reception = Reception(bus, members, ingest.answer, store.release, KnownShards(store).has)
             reception.open()
             _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
+            told = RefusalsTold(_LOG)
             while not stop.wait(config.poll_s):
                 reception.look_again()
+                told.tell()
                 if worker.has_ended():
                     store.release(config.shard_id)  # what it had in hand need not wait for the ends of its leases
                     worker.restart()

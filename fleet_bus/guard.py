@@ -45,17 +45,20 @@ class GuardLimits:
             address of their mobile network.
     """
 
-    handshake_s: float = 5.0
-    handshakes: int = 256
-    of_address: int = 4_096
+    handshake_s: float
+    handshakes: int
+    of_address: int
 
     def __post_init__(self) -> None:
         if self.handshake_s <= 0 or self.handshakes < 1 or self.of_address < 1:
             raise BusConfigError(f"limits of a router must be positive: {self}")
 
 
+USUAL_LIMITS: Final = GuardLimits(handshake_s=5.0, handshakes=256, of_address=4_096)
+
+
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SeenConnection:
     """A connection: its descriptor, the inode of its socket, the other side, and since when it is known, s."""
 
     descriptor: int
@@ -65,18 +68,18 @@ class Seen:
 
 
 def to_close(
-    open_ones: Iterable[Seen], sessions: Collection[Address], limits: GuardLimits, now_s: float
-) -> list[tuple[Seen, str]]:
+    open_ones: Iterable[SeenConnection], sessions: Collection[Address], limits: GuardLimits, now_s: float
+) -> list[tuple[SeenConnection, str]]:
     """Which connections go, each with the reason.
 
     Args:
         open_ones: all connections at the router's ports.
         sessions: the other sides of those that are sessions.
         limits: what is borne.
-        now_s: by the clock of `Seen.since_s`.
+        now_s: by the clock of `SeenConnection.since_s`.
     """
     ordered = sorted(open_ones, key=lambda one: (one.since_s, one.inode))
-    going: dict[int, tuple[Seen, str]] = {}
+    going: dict[int, tuple[SeenConnection, str]] = {}
     handshakes = [one for one in ordered if one.peer not in sessions]
     for one in handshakes:
         if now_s - one.since_s > limits.handshake_s:
@@ -110,7 +113,9 @@ class ConnectionGuard:
         self, ports: Collection[int], sessions: Callable[[], Collection[Address]], limits: GuardLimits
     ) -> None:
         self._ports, self._sessions, self._limits = frozenset(ports), sessions, limits
-        self._seen: dict[int, Seen | int] = {}  # by descriptor; of what is no connection of the router its inode
+        self._seen: dict[
+            int, SeenConnection | int
+        ] = {}  # by descriptor; of what is no connection of the router its inode
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="guard", daemon=True)
         self._thread.start()
@@ -130,7 +135,7 @@ class ConnectionGuard:
     def look(self) -> int:
         """Close what is beyond the limits; how many those were."""
         self._refresh()
-        mine = [one for one in self._seen.values() if isinstance(one, Seen)]
+        mine = [one for one in self._seen.values() if isinstance(one, SeenConnection)]
         going = to_close(mine, self._sessions(), self._limits, time.monotonic())
         ended = Counter((one.peer[0], reason) for one, reason in going if _shut(one))
         for (host, reason), n in ended.items():
@@ -140,23 +145,23 @@ class ConnectionGuard:
 
     def _refresh(self) -> None:
         """Look at the descriptors that are new; one may be another socket than at the last look."""
-        found: dict[int, Seen | int] = {}
+        found: dict[int, SeenConnection | int] = {}
         for descriptor in _descriptors():
             inode = _socket_inode(descriptor)
             if not inode:
                 continue
             before = self._seen.get(descriptor)
-            if before is not None and inode == (before.inode if isinstance(before, Seen) else before):
+            if before is not None and inode == (before.inode if isinstance(before, SeenConnection) else before):
                 found[descriptor] = before
             else:
                 found[descriptor] = self._looked_at(descriptor, inode)
         self._seen = found
 
-    def _looked_at(self, descriptor: int, inode: int) -> Seen | int:
+    def _looked_at(self, descriptor: int, inode: int) -> SeenConnection | int:
         ends = _ends(descriptor)
         if ends is None or ends[0][1] not in self._ports:
             return inode
-        return Seen(descriptor, inode, ends[1], time.monotonic())
+        return SeenConnection(descriptor, inode, ends[1], time.monotonic())
 
 
 def _descriptors() -> list[int]:
@@ -187,7 +192,7 @@ def _ends(descriptor: int) -> tuple[Address, Address] | None:
     return address(own[0], own[1]), address(peer[0], peer[1])
 
 
-def _shut(one: Seen) -> bool:
+def _shut(one: SeenConnection) -> bool:
     """End a connection, if its descriptor is still that one."""
     try:
         copy = os.dup(one.descriptor)

@@ -13,7 +13,7 @@ from typing import Final
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
-from gnd.fleet_bus.guard import Address, ConnectionGuard, GuardLimits, address
+from gnd.fleet_bus.guard import USUAL_LIMITS, Address, ConnectionGuard, GuardLimits, address
 from gnd.fleet_bus.part import Part
 
 _LOG = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ def open_router(
     Args:
         listen: endpoints to open, "tcp/host:port".
         connect: endpoints of other routers to link with.
-        limits: of connections; by default those of `GuardLimits`.
+        limits: of connections; by default `USUAL_LIMITS`.
 
     Raises:
         PortInUse: another process listens there.
@@ -40,7 +40,7 @@ def open_router(
     os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVING_THREADS}))")  # read at first use
     config = BusConfig(mode="router", listen=tuple(listen), connect=tuple(connect))
     bus = open_bus(config, name="router")
-    bus.keep(_Guarding(bus, limits or GuardLimits()))
+    bus.keep(_Guarding(bus, limits or USUAL_LIMITS))
     return bus
 
 

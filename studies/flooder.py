@@ -28,6 +28,7 @@ from studies.frame.options import check, option
 from studies.small_cloud import TILE, SmallCloud, base_tile, change_report, small_cloud
 
 SESSIONS: Final = 4
+KINDS: Final = ("reports", "names", "nonsense")
 LEAD_S: Final = 2.0
 REQUEST_S: Final = 60.0
 
@@ -39,6 +40,7 @@ class FlooderOptions:
     vehicles: int = option(20, "Honest vehicles.", span=(1, 1000))
     hz: float = option(2.0, "Reports a second of each.", span=(0.01, 100))
     times: float = option(100.0, "The flooder sends so many times as many as one of them.", span=(1, 100_000))
+    kinds: tuple[str, ...] = option(KINDS, "Kinds of floods.", known=KINDS)
     rounds: int = option(4, "Calm and flooded times.", span=(1, 100))
     seconds: float = option(8.0, "Length of each, s.", span=(1, 600))
     shards: int = option(1, "Merger shards.", span=(1, 8))
@@ -53,7 +55,7 @@ OPTIONS: Final = FlooderOptions
 def run(options: FlooderOptions | None = None) -> list[Figure]:
     """Measure each kind of flood on a cloud of its own."""
     options = options or FlooderOptions()
-    return [figure for kind in ("reports", "names", "nonsense") for figure in _figures(kind, options)]
+    return [figure for kind in options.kinds for figure in _figures(kind, options)]
 
 
 def _figures(kind: str, options: FlooderOptions) -> list[Figure]:

@@ -10,12 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import zenoh
-
 from gnd.deploy.chaos.street import ChaosStreet, read_street
-from gnd.fleet_bus.config import BusConfig, zenoh_config
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
 from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.keys import ROOT, batch_key, catalog_keys, state_key, tiles_key
+from gnd.schemas.keys import alive_key, batch_key, catalog_keys, state_key, tiles_key
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportQuestion
 from gnd.schemas.tiles_batch import TilesRequest
@@ -75,7 +74,8 @@ def flood(kind: str, connect: str, hz: float, tile: int, gate: str = "", *, stop
     """Send without waiting for answers and without obeying any, so many a second, while the file `gate` is there ("":
     always).
     """
-    with zenoh.open(zenoh_config(BusConfig(connect=(connect,)))) as session:
+    with open_bus(BusConfig(connect=(connect,)), name=FLOODER) as bus:
+        session = bus.connection.session
         source, due_s = messages(kind, TileId(tile)), time.monotonic()
         while not stop.is_set():
             if gate and not Path(gate).exists():
@@ -85,10 +85,9 @@ def flood(kind: str, connect: str, hz: float, tile: int, gate: str = "", *, stop
             key, payload = next(source)
             session.get(
                 key,
-                zenoh.handlers.Callback(lambda _reply: None),
+                lambda _reply: None,
                 payload=payload,
                 timeout=PATIENCE_MS / 1000,
-                congestion_control=zenoh.CongestionControl.DROP,
             )
             due_s = max(due_s + 1.0 / hz, time.monotonic() - 1.0)
             time.sleep(max(0.0, due_s - time.monotonic()))
@@ -96,7 +95,7 @@ def flood(kind: str, connect: str, hz: float, tile: int, gate: str = "", *, stop
 
 def ghosts(connect: str, names: tuple[str, ...], *, stop: threading.Event) -> None:
     """Hold tokens of shards that do not exist."""
-    with zenoh.open(zenoh_config(BusConfig(connect=(connect,)))) as session:
-        tokens = [session.liveliness().declare_token(f"{ROOT}/alive/merger/{name}") for name in names]
+    with open_bus(BusConfig(connect=(connect,)), name="ghosts") as bus:
+        for name in names:
+            bus.declare_alive(alive_key("merger", name))
         stop.wait()
-        del tokens

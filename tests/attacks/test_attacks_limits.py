@@ -28,7 +28,7 @@ from gnd.deploy.processes import ProcessSpec
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig, zenoh_config
 from gnd.fleet_bus.errors import Busy, RequestFailed
-from gnd.fleet_bus.guard import ConnectionGuard, GuardLimits
+from gnd.fleet_bus.guard import USUAL_LIMITS, ConnectionGuard
 from gnd.fleet_bus.requesting import LONGEST_BUSY_S
 from gnd.fleet_bus.router import open_router
 from gnd.fleet_bus.seldom import LINES_A_MINUTE, MAX_LINE_CHARACTERS
@@ -271,7 +271,7 @@ def test_attack_idle_connections(cloud, honest):
     sockets = held(cloud.connect, 1500)
     try:
         newcomer_is_served(cloud, honest)
-        wait_for(lambda: open_ones(sockets) <= GuardLimits().handshakes, "most are closed")
+        wait_for(lambda: open_ones(sockets) <= USUAL_LIMITS.handshakes, "most are closed")
         wait_for(lambda: open_ones(sockets) == 0, "all are closed")
     finally:
         close_all(sockets)
@@ -302,7 +302,7 @@ def test_attack_slow_loris(cloud, honest):
 def test_attack_connections_of_one_address(free_port, monkeypatch):
     """One address opens session after session: beyond its share they are closed, and another address comes in."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    with open_router([endpoint], limits=GuardLimits(of_address=20)):
+    with open_router([endpoint], limits=replace(USUAL_LIMITS, of_address=20)):
         sockets = held(endpoint, 60, host="127.0.0.2")
         wait_for(lambda: open_ones(sockets) <= 20, "those beyond the share are closed")
         with open_bus(BusConfig(connect=(endpoint,)), name="honest") as bus:

@@ -7,7 +7,7 @@ import pytest
 
 from gnd.fleet_bus import turns
 from gnd.fleet_bus.errors import BusConfigError
-from gnd.fleet_bus.guard import GuardLimits, Seen, address, to_close
+from gnd.fleet_bus.guard import GuardLimits, SeenConnection, address, to_close
 from gnd.fleet_bus.requesting import RequestAnswers, busy_text
 from gnd.fleet_bus.seldom import LINES_A_MINUTE, MAX_LINE_CHARACTERS, Seldom
 from gnd.fleet_bus.turns import InTurn
@@ -123,8 +123,8 @@ def test_log_lines_are_few_and_short(caplog, clock):
     assert all(len(one.getMessage()) <= MAX_LINE_CHARACTERS + 50 for one in caplog.records)
 
 
-def seen(n, host="10.0.0.1", since_s=0.0) -> Seen:
-    return Seen(n, n, (host, n), since_s)
+def seen(n, host="10.0.0.1", since_s=0.0) -> SeenConnection:
+    return SeenConnection(n, n, (host, n), since_s)
 
 
 def test_handshakes_end_and_sessions_stay():
@@ -142,7 +142,7 @@ def test_of_too_many_handshakes_the_oldest_of_the_busiest_address_go():
 
 
 def test_of_an_address_with_too_many_the_newest_go():
-    limits = GuardLimits(of_address=2)
+    limits = GuardLimits(handshake_s=5.0, handshakes=256, of_address=2)
     ones = [seen(n, since_s=n) for n in range(1, 5)]
     going = to_close([*ones, seen(9, "10.0.0.2", 9.0)], {one.peer for one in ones}, limits, 4.0)
     assert [(one.inode, why) for one, why in going] == [(3, "address"), (4, "address")]
@@ -155,4 +155,4 @@ def test_addresses_are_compared_in_one_form():
 
 def test_limits_that_close_everything_are_refused():
     with pytest.raises(BusConfigError):
-        GuardLimits(handshake_s=0.0)
+        GuardLimits(handshake_s=0.0, handshakes=1, of_address=1)
