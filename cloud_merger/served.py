@@ -1,6 +1,6 @@
 """CPU that was spent on each vehicle's uploads of late: who has had least comes first.
 
-Names that are new share one account of a quarter of it all, however many they are: else an invented name, on which
+Of names that are new one comes after every three that are known, however many they are: else an invented name, on which
 nothing was spent yet, would always come first.
 """
 
@@ -15,8 +15,6 @@ from gnd.fleet_bus.turns import KNOWN_SHARE, KnownTurns
 
 HALF_LIFE_S: Final = 60.0
 REMEMBERED: Final = 4_096
-_NEW: Final = "\0new"
-_KNOWN: Final = "\0known"
 
 
 class ServedCpu:
@@ -35,10 +33,9 @@ class ServedCpu:
     def spent(self, vehicle: str, cpu_s: float) -> None:
         """So much CPU went into an upload of a vehicle; "": Gaussians, which do not tell whose they are."""
         with self._lock:
-            group = _KNOWN if not vehicle or self._turns.is_known(vehicle) else _NEW
-            for name in (vehicle, group):
-                self._spent[name] = self._faded(name) + cpu_s, self._clock_s()
-                self._spent.move_to_end(name)
+            self._turns.is_known(vehicle)
+            self._spent[vehicle] = self._faded(vehicle) + cpu_s, self._clock_s()
+            self._spent.move_to_end(vehicle)
             while len(self._spent) > REMEMBERED:
                 self._spent.popitem(last=False)
 
@@ -52,10 +49,17 @@ class ServedCpu:
                 spent_s = self._faded(vehicle) / share
                 group = groups[not vehicle or self._turns.is_known(vehicle)]
                 group.append((spent_s, random.random(), vehicle))  # among equals no name comes first
-            known_first = self._faded(_KNOWN) <= KNOWN_SHARE * self._faded(_NEW)
-            ordered = sorted(groups[known_first]) + sorted(groups[not known_first])
-        return [vehicle for *_, vehicle in ordered]
+            known, new = ([vehicle for *_, vehicle in sorted(groups[is_known])] for is_known in (True, False))
+        return _mixed(known, new)
 
     def _faded(self, name: str) -> float:
         amount, since_s = self._spent.get(name, (0.0, 0.0))
         return amount * 0.5 ** ((self._clock_s() - since_s) / HALF_LIFE_S) if amount else 0.0
+
+
+def _mixed(known: list[str], new: list[str]) -> list[str]:
+    """One that is new after each `KNOWN_SHARE` that are known, while there are of both."""
+    found: list[str] = []
+    for at, vehicle in enumerate(new):
+        found += [*known[at * KNOWN_SHARE : (at + 1) * KNOWN_SHARE], vehicle]
+    return found + known[len(new) * KNOWN_SHARE :]

@@ -113,9 +113,7 @@ class ConnectionGuard:
         self, ports: Collection[int], sessions: Callable[[], Collection[Address]], limits: GuardLimits
     ) -> None:
         self._ports, self._sessions, self._limits = frozenset(ports), sessions, limits
-        self._seen: dict[
-            int, SeenConnection | int
-        ] = {}  # by descriptor; of what is no connection of the router its inode
+        self._seen: dict[int, SeenConnection | int] = {}  # by descriptor; an inode: of another socket
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="guard", daemon=True)
         self._thread.start()

@@ -21,7 +21,7 @@ HEAD_START_NS: Final = NS_PER_S
 """So long an upload is left to the shard that received it, which holds its tiles in memory."""
 MOST_TURNS: Final = 4096
 """Vehicles that are looked at to find whose turn it is."""
-AT_ONCE_OF_VEHICLE: Final = 4
+AT_ONCE_OF_VEHICLE: Final = 2
 """Uploads of one vehicle that are claimed together."""
 InTurnOf = Callable[[list[str]], list[str]]
 """Brings vehicles into the order of their turns."""

@@ -15,6 +15,7 @@ import time
 import zlib
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -346,9 +347,7 @@ def test_attack_half_open_tls(tmp_path, free_port):
     settings.insert_json5("transport/link/tls/listen_private_key", json.dumps(key))
     hello = _client_hello()
     with zenoh.open(settings) as router, ExitStack() as stack:
-        guard = ConnectionGuard(
-            [free_port], lambda: {_peer(link.dst) for link in router.info.links()}, GuardLimits(2.0)
-        )
+        guard = ConnectionGuard([free_port], partial(_peers, router), replace(USUAL_LIMITS, handshake_s=2.0))
         stack.callback(guard.close)
         sockets = [*held(f"tls/127.0.0.1:{free_port}", 150), *held(f"tls/127.0.0.1:{free_port}", 150, hello)]
         stack.callback(close_all, sockets)

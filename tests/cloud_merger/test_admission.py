@@ -147,5 +147,16 @@ def test_who_has_had_least_comes_first_and_invented_names_do_not(clock):
         served.spent(f"invented-{n}", 1.0)
     assert served.in_turn(["much", "new", "little"]) == ["little", "much", "new"]
     clock.now_s += 3600.0
-    served.spent("little", 100.0)
-    assert served.in_turn(["much", "new", "little"])[0] == "new", "what was spent fades"
+    served.spent("little", 1.0)
+    assert served.in_turn(["much", "new", "little"]) == ["much", "little", "new"], "what was spent fades"
+
+
+def test_of_names_that_are_new_one_comes_after_three_that_are_known(clock):
+    served = ServedCpu(clock)
+    known = [f"known-{n}" for n in range(6)]
+    served.in_turn(known)
+    clock.now_s += 31.0
+    served.in_turn(known)
+    turns = served.in_turn([*(f"new-{n}" for n in range(50)), *known])
+    assert [name.startswith("new") for name in turns[:9]] == [False, False, False, True] * 2 + [True]
+    assert sorted(turns) == sorted([*(f"new-{n}" for n in range(50)), *known])
