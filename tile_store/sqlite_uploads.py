@@ -22,7 +22,7 @@ HEAD_START_NS: Final = NS_PER_S
 MOST_TURNS: Final = 4096
 """Vehicles that are looked at to find whose turn it is."""
 AT_ONCE_OF_VEHICLE: Final = 2
-"""Uploads of one vehicle that are claimed together."""
+"""Uploads of one vehicle that are claimed together, at least."""
 InTurnOf = Callable[[list[str]], list[str]]
 """Brings vehicles into the order of their turns."""
 LONGEST_LEASE_NS: Final = 3600 * NS_PER_S
@@ -60,8 +60,10 @@ def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, in_turn: InTur
 
 def _fresh(c: apsw.Connection, owner: str, n: int, in_turn: InTurnOf) -> list[Row]:
     found: list[Row] = []
-    for vehicle in in_turn([vehicle for (vehicle,) in fetch(c, "turns_of_uploads", {"n": MOST_TURNS})]):
-        wanted = _clock() | {"vehicle": vehicle, "home": owner, "n": min(AT_ONCE_OF_VEHICLE, n - len(found))}
+    vehicles = [vehicle for (vehicle,) in fetch(c, "turns_of_uploads", {"n": MOST_TURNS})]
+    each = max(AT_ONCE_OF_VEHICLE, n // max(1, len(vehicles)))
+    for vehicle in in_turn(vehicles):
+        wanted = _clock() | {"vehicle": vehicle, "home": owner, "n": min(each, n - len(found))}
         found += fetch(c, "fresh_uploads", wanted)
         if len(found) >= n:
             break

