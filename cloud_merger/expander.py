@@ -6,6 +6,7 @@ comes late changes nothing.
 """
 
 import logging
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,11 +20,14 @@ from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.errors import BadReport, MergerError, NotUnderstood
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.ingest import one_line
+from gnd.cloud_merger.served import ServedCpu
 from gnd.cloud_merger.short_reports import FirstSaid, ShortReports
 from gnd.cloud_merger.states import STATUS
 from gnd.cloud_merger.stored import Bases, encoded_parts
 from gnd.cloud_merger.survey.inbox import SurveyInbox
 from gnd.cloud_merger.wants import asked_voxels
+from gnd.fleet_bus.refusals import counted
+from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.errors import GndError
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.errors import SchemaError
@@ -42,6 +46,7 @@ UPLOADS_AT_ONCE: Final = 8
 """Uploads that a thread claims together."""
 DAMAGED_RETRY_S: Final = 2.0
 _LOG = logging.getLogger(__name__)
+_SELDOM = Seldom(_LOG)
 Tell = Callable[[str, ReportState], object]
 
 
@@ -78,6 +83,7 @@ class Expander:
         self._short = ShortReports(store, config.merge, config.want, bases or Bases(store))
         self._features = FeatureInbox(store, config.features, config.feature_layer, config.ingest.reach_tiles)
         self._map, self._surveys = MapCheck(store, config.ingest), SurveyInbox(store)
+        self._served = ServedCpu()
         self._lock = Lock()
         self._districts: OrderedDict[str, None] = OrderedDict()  # newest last
 
@@ -93,9 +99,12 @@ class Expander:
         Raises:
             StoreError: the store has failed; what was claimed waits for the end of its lease.
         """
-        claims = self._store.claim_uploads(self._config.shard_id, UPLOADS_AT_ONCE, self._config.lease_s)
+        owner, lease_s = self._config.shard_id, self._config.lease_s
+        claims = self._store.claim_uploads(owner, UPLOADS_AT_ONCE, lease_s, self._served.in_turn)
         for claim in claims:
+            before_s = time.thread_time()
             self._work_on(claim)
+            self._served.spent(claim.upload.vehicle, time.thread_time() - before_s)
         return len(claims)
 
     def _work_on(self, claim: UploadClaim) -> None:
@@ -108,7 +117,7 @@ class Expander:
         except StoreError:
             raise
         except Exception as error:  # one upload never stops the others
-            _LOG.exception("upload %s failed, attempt %d", claim.upload.report_id, claim.attempts)
+            _SELDOM.exception("upload %s failed, attempt %d", claim.upload.report_id, claim.attempts)
             if claim.attempts < MAX_ATTEMPTS:
                 self._store.postpone_upload(claim, RETRY_S * claim.attempts)
                 return
@@ -151,7 +160,7 @@ class Expander:
         try:
             return self._outcome(claim)
         except NotUnderstood as error:
-            _LOG.info("asked for report %s whole: %s", claim.upload.report_id, error)
+            _SELDOM.info("asked for report %s whole: %s", claim.upload.report_id, error)
             return self._told(Settled(claim, "resend", reason=one_line(str(error))))
         except (SchemaError, BadReport) as error:
             return self._refused(claim, one_line(f"{type(error).__name__}: {error}"))
@@ -229,14 +238,15 @@ class Expander:
         """Another vehicle has this report id: the journal keeps this report under one of its own."""
         settled = outcome.settled
         rows = tuple(_under_own_id(row) for row in settled.rows)
-        _LOG.warning("%s; kept as %s", taken, rows[0].report_id)
+        _SELDOM.warning("%s; kept as %s", taken, rows[0].report_id)
         return replace(outcome, settled=replace(settled, rows=rows))
 
     def _released(self, claim: UploadClaim, rows: tuple[ReportRow, ...]) -> _Outcome:
         return self._told(Settled(claim, "released", rows))
 
     def _refused(self, claim: UploadClaim, reason: str) -> _Outcome:
-        _LOG.warning("quarantined %s of report %s: %s", claim.upload.form, claim.upload.report_id, reason)
+        counted("upload", "refused")
+        _SELDOM.warning("quarantined %s of report %s: %s", claim.upload.form, claim.upload.report_id, reason)
         return self._told(Settled(claim, "quarantined", reason=reason))
 
     def _set_aside(self, claim: UploadClaim, why: str) -> _Outcome:

@@ -29,6 +29,7 @@ from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.packed import PackedReport, digest_of
 
 MEASURED: Final = (int(ChangeClass.NEW), int(ChangeClass.MODIFIED))
+MAX_PIECES: Final = 128  # of way: each is looked along at four places at least, however short it is
 MAX_FLOORS: Final = 400  # of 1 m: looking along a track takes memory for each
 
 
@@ -59,10 +60,10 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
             f"vehicle compared with {packed.base_digest.hex()}"
         )
     try:
-        flags = decode_flags([(tile.tile_id, tile.gaussians) for tile in bases], packed.flags)
-        track = decode_track(district, packed.track)
-        _check_flags(packed.report_id, flags)
+        track = decode_track(district, packed.track)  # the short one first: it says how much is to be looked along
         _check_way(packed.report_id, track)
+        flags = decode_flags([(tile.tile_id, tile.gaussians) for tile in bases], packed.flags)
+        _check_flags(packed.report_id, flags)
         observed = observed_along(track, flags)
     except (CodecError, ConfigError, ShapeError, TrackError) as error:
         raise BadReport(f"report {packed.report_id} in {len(packed.flags)} bytes of flags: {error}") from error
@@ -88,6 +89,11 @@ def _check_way(report_id: str, track: Track) -> None:
         raise BadReport(
             f"report {report_id} rests on {track.way_m:.0f} m of way, the limit is {limits.MAX_WAY_OF_REPORT_M:g} m: "
             f"such a report is read whole only"
+        )
+    if len(track.pieces) > MAX_PIECES:
+        raise BadReport(
+            f"report {report_id} rests on {len(track.pieces)} pieces of way, the limit is {MAX_PIECES}: such a report "
+            f"is read whole only"
         )
 
 

@@ -7,8 +7,11 @@ time share. What the bytes say is found out later (`expander`), and told on the 
 import logging
 from collections.abc import Callable
 
+from gnd.cloud_merger.admission import Admission
 from gnd.cloud_merger.errors import BadReport
+from gnd.fleet_bus.refusals import counted
 from gnd.fleet_bus.seals import Holder
+from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.features import is_feature_layer
 from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError
@@ -19,7 +22,7 @@ from gnd.tile_store import clocks
 from gnd.tile_store.store import Store
 from gnd.tile_store.uploads import Upload
 
-_LOG = logging.getLogger(__name__)
+_SELDOM = Seldom(logging.getLogger(__name__))
 
 
 class Ingest:
@@ -30,6 +33,7 @@ class Ingest:
         home: name of this shard, which looks at what it has received before others do.
         on_stored: called after a new upload is durable.
         now_ns: the clock, int ns UTC.
+        admission: who may send how much; None: all may.
     """
 
     def __init__(
@@ -38,8 +42,10 @@ class Ingest:
         home: str,
         on_stored: Callable[[], object] = lambda: None,
         now_ns: Callable[[], int] = clocks.day_ns,
+        admission: Admission | None = None,
     ) -> None:
         self._store, self._home, self._on_stored, self._now_ns = store, home, on_stored, now_ns
+        self._admission = admission
 
     def answer(self, key: str, payload: bytes, asker: Holder | None = None) -> ChangeAck:
         """The ack of one message: "stored" and "duplicate" only when its bytes are durable.
@@ -51,6 +57,7 @@ class Ingest:
 
         Raises:
             StoreError: it could not be kept; the vehicle is to send it again.
+            Busy: more than is admitted; the vehicle is to send it later.
         """
         received_ns, report_id = self._now_ns(), ""
         try:
@@ -58,6 +65,8 @@ class Ingest:
             report_id = head.report_id
             check_head(key, head, received_ns)
             self._check_asker(head, asker)
+            if self._admission is not None:
+                self._admission.admit(key, head, len(payload))
         except (SchemaError, BadReport) as error:
             return self._refuse(key, payload, report_id, error)
         upload = Upload(key, payload, report_id, head.vehicle, head.form, received_ns)
@@ -76,9 +85,12 @@ class Ingest:
             raise BadReport(f"Gaussians of report {head.report_id}, of which {asker} has sent no flags")
 
     def _refuse(self, key: str, payload: bytes, report_id: str, error: Exception) -> ChangeAck:
+        if self._admission is not None:
+            self._admission.admit_nonsense()
         reason = one_line(f"{type(error).__name__}: {error}")
         self._store.quarantine(payload, reason, source=key)
-        _LOG.warning("quarantined an upload of %d bytes on %s: %s", len(payload), key, reason)
+        counted("upload", "unreadable")
+        _SELDOM.warning("quarantined an upload of %d bytes on %s: %s", len(payload), key, reason)
         return ChangeAck(report_id, "quarantined", reason)
 
 

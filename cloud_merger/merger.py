@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Final
 
+from gnd.cloud_merger.admission import Admission
 from gnd.cloud_merger.announce import Announcer
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import Expander
@@ -13,7 +14,7 @@ from gnd.cloud_merger.expander_threads import working
 from gnd.cloud_merger.ingest import Ingest
 from gnd.cloud_merger.leases import Leases
 from gnd.cloud_merger.metrics import ShardMetrics
-from gnd.cloud_merger.ownership import Members, following
+from gnd.cloud_merger.ownership import KnownShards, Members, following
 from gnd.cloud_merger.reception import Reception
 from gnd.cloud_merger.states import States
 from gnd.cloud_merger.stored import Bases
@@ -24,6 +25,7 @@ from gnd.cloud_merger.worker_process import Address, worker_process
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.health import HealthServer
+from gnd.fleet_bus.refusals import RefusalsTold, show_refusals
 from gnd.tile_store.errors import StoreClosed, StoreError
 from gnd.tile_store.metrics import store_checks
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -63,12 +65,18 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
     ):
         store.release(config.shard_id)  # leases of an earlier life
         with worker_process(config, metrics_at) as worker:
-            ingest = Ingest(store, config.shard_id, on_stored=worker.wake)  # look at the outside, keep the bytes
+            admission = Admission(store)
+            # look at the outside, keep the bytes
+            ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission)
             members = Members(config.shard_id)
             States(store, bus).open()
-            Reception(bus, members, ingest.answer, on_death=store.release).open()
+            reception = Reception(bus, members, ingest.answer, store.release, KnownShards(store).has)
+            reception.open()
             _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
+            told = RefusalsTold(_LOG)
             while not stop.wait(config.poll_s):
+                reception.look_again()
+                told.tell()
                 if worker.has_ended():
                     store.release(config.shard_id)  # what it had in hand need not wait for the ends of its leases
                     worker.restart()
@@ -94,6 +102,7 @@ def run_worker(
         ExitStack() as stack,
     ):
         metrics = ShardMetrics()
+        show_refusals(metrics.registry)
         if metrics_at is not None:
             host, port = metrics_at
             stack.enter_context(HealthServer(port, metrics.registry, store_checks(store, bus), host=host))

@@ -4,7 +4,9 @@ Every member computes the same owner from the same members, without talking; whe
 Ownership spreads the ingest and keeps caches warm. It protects nothing: that is the store's compare-and-swap.
 """
 
+import logging
 import threading
+import time
 from collections.abc import Collection
 from hashlib import blake2b
 from typing import Final
@@ -12,8 +14,12 @@ from typing import Final
 from gnd.fleet_bus.bus import Bus
 from gnd.gnd_map.tile_id import District
 from gnd.schemas.keys import alive_keys, parse_alive_key
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.store import Store
 
 ROLE: Final = "merger"
+LOOK_EVERY_S: Final = 1.0
+_LOG = logging.getLogger(__name__)
 
 
 def owner_of(district: District, members: Collection[str]) -> str:
@@ -48,6 +54,29 @@ class Members:
     def is_mine(self, district: District) -> bool:
         """Whether this shard owns the district among those that live."""
         return owner_of(district, self._living) == self.own
+
+
+class KnownShards:
+    """The shards that work on this map, as the store says: each gives a sign of life there, and nobody who cannot write
+    to the store can forge one. Safe to use from any thread.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._lock = threading.Lock()
+        self._living: frozenset[str] = frozenset()
+        self._until_s = 0.0
+
+    def has(self, name: str) -> bool:
+        """Whether a shard of this name lives, as it was at most a second ago; a store that fails says what it said."""
+        with self._lock:
+            if time.monotonic() >= self._until_s:
+                self._until_s = time.monotonic() + LOOK_EVERY_S
+                try:
+                    self._living = frozenset(shard.owner for shard in self._store.shards() if shard.is_alive)
+                except StoreError as error:
+                    _LOG.warning("cannot see which shards live: %s", error)
+            return name in self._living
 
 
 def following(bus: Bus, own: str) -> Members:

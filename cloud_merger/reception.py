@@ -8,6 +8,7 @@ again) or two (storing twice has no effect).
 
 import logging
 import threading
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Final
 
@@ -20,8 +21,13 @@ from gnd.gnd_map.tile_id import District
 from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
+from gnd.schemas.upload_peek import peek_upload
 
 MAX_DECLARED: Final = 4096
+MAX_TOKENS: Final = 4096
+"""Names of tokens that are remembered until the store knows them."""
+REMEMBERED_REPORTS: Final = 65_536
+"""Report ids whose vehicle is remembered."""
 WORKERS: Final = 32  # threads of all of them: acks that come at the same time share a commit
 _LOG = logging.getLogger(__name__)
 
@@ -37,10 +43,22 @@ class Reception:
         members: kept up to date here.
         answer: takes (key, encoded message, who has sealed it) and gives the ack; called from several threads.
         on_death: called with the name of a member that has gone.
+        is_shard: whether a name is that of a shard that works on this map, by what the store says: anybody may hold a
+            token. `look_again` asks anew.
     """
 
-    def __init__(self, bus: Bus, members: Members, answer: Answer, on_death: Callable[[str], object]) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        members: Members,
+        answer: Answer,
+        on_death: Callable[[str], object],
+        is_shard: Callable[[str], bool] = lambda _name: True,
+    ) -> None:
         self._bus, self._members, self._answer, self._on_death = bus, members, answer, on_death
+        self._is_shard = is_shard
+        self._tokens: set[str] = set()
+        self._turns = UploadTurns()
         self._lock = threading.Lock()
         self._declared: dict[Place, Serving] = {}  # oldest first
         self._every: Serving | None = None
@@ -48,7 +66,9 @@ class Reception:
     def open(self) -> None:
         """Begin to receive; the sign of life comes last."""
         self._bus.watch_alive(alive_keys(ROLE), self._on_alive)
-        self._every = self._bus.serve(change_keys(), self._fallback, workers=WORKERS, kind="change")
+        self._every = self._bus.serve(
+            change_keys(), self._fallback, workers=WORKERS, kind="change", turn_of=self._turns.of
+        )
         self._bus.declare_alive(alive_key(ROLE, self._members.own))
 
     @property
@@ -62,7 +82,14 @@ class Reception:
         with self._lock:
             if place in self._declared or not self._members.is_mine(place[1]):
                 return
-            serving = self._bus.serve(change_key(*place), self._own, complete=True, kind="change", beside=self._every)
+            serving = self._bus.serve(
+                change_key(*place),
+                self._own,
+                complete=True,
+                kind="change",
+                beside=self._every,
+                turn_of=self._turns.of,
+            )
             self._declared[place] = serving
             if len(self._declared) > MAX_DECLARED:
                 self._declared.pop(next(iter(self._declared))).close()
@@ -73,7 +100,13 @@ class Reception:
                 self._declared.pop(place).close()
 
     def _own(self, request: Request) -> bytes:
-        return self._answer(request.key, request.payload, request.asker).encode()
+        return self._answered(request).encode()
+
+    def _answered(self, request: Request) -> ChangeAck:
+        ack = self._answer(request.key, request.payload, request.asker)
+        if ack.status != "quarantined":
+            self._turns.note(request.payload)
+        return ack
 
     def _fallback(self, request: Request) -> bytes:
         place = _place(request.key)
@@ -81,19 +114,61 @@ class Reception:
             return self._own(request)  # nobody owns such a key; the answer says why it is refused
         if place in self._declared or not self._members.is_mine(place[1]):
             raise NotMine
-        ack = self._answer(request.key, request.payload, request.asker)
+        ack = self._answered(request)
         if ack.status != "quarantined":
             self._declare(place)
         return ack.encode()
 
+    def look_again(self) -> None:
+        """Believe the tokens of shards that the store has come to know meanwhile, of none that it forgot."""
+        for member in sorted(self._tokens):
+            self._note(member, alive=self._is_shard(member))
+
     def _on_alive(self, key: str, alive: bool) -> None:
-        member = parse_alive_key(key)[1]
+        try:
+            member = parse_alive_key(key)[1]
+        except SchemaError:
+            return
+        if not alive:
+            self._tokens.discard(member)
+        elif len(self._tokens) < MAX_TOKENS:
+            self._tokens.add(member)
+        self._note(member, alive=alive and self._is_shard(member))
+
+    def _note(self, member: str, *, alive: bool) -> None:
         if not self._members.note(member, alive=alive):
             return
         _LOG.info("%s: %s has %s", self._members.own, member, "joined" if alive else "gone")
         if not alive:
             self._on_death(member)
         self._give_up_foreign()
+
+
+class UploadTurns:
+    """Whose turn an upload takes. Gaussians name a report only: it is that of the vehicle whose flags were taken under
+    this id. Safe in several threads.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._vehicle_of: OrderedDict[bytes, str] = OrderedDict()
+
+    def of(self, _key: str, payload: bytes) -> str:
+        """The vehicle; "" where nobody knows."""
+        vehicle, report_id = peek_upload(payload)
+        if vehicle or not report_id:
+            return vehicle
+        with self._lock:
+            return self._vehicle_of.get(report_id, "")
+
+    def note(self, payload: bytes) -> None:
+        """An upload was taken."""
+        vehicle, report_id = peek_upload(payload)
+        if vehicle and report_id:
+            with self._lock:
+                self._vehicle_of[report_id] = vehicle
+                if len(self._vehicle_of) > REMEMBERED_REPORTS:
+                    self._vehicle_of.popitem(last=False)
 
 
 def _place(key: str) -> Place | None:

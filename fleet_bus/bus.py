@@ -10,7 +10,7 @@ from gnd.fleet_bus.ledger import Ledger, SharesOf
 from gnd.fleet_bus.part import Part
 from gnd.fleet_bus.requesting import RetryPolicy
 from gnd.fleet_bus.seals import PUBLISHERS
-from gnd.fleet_bus.serving import Handler, Serving
+from gnd.fleet_bus.serving import Handler, Serving, TurnOf
 from gnd.fleet_bus.subscribing import (
     AliveToken,
     AliveWatch,
@@ -155,6 +155,7 @@ class Bus:
         workers: int = 4,
         kind: str = "control",
         beside: Serving | None = None,
+        turn_of: TurnOf | None = None,
     ) -> Serving:
         """Answers requests in threads of our own, so that a handler may itself ask, wait or compute.
 
@@ -162,15 +163,24 @@ class Bus:
             keyexpr: keys that are served.
             handler: gives bytes (one answer on the asked key) or (key, payload) pairs (answers to a region, which are
                 given by one thread of their own, at `serving.REGION_BYTE_S`). It may
-                raise `NotMine` (no reply), `Refused` (never ask again); any other exception makes the asker try again.
+                raise `NotMine` (no reply), `Refused` (never ask again), `Busy` (ask again later); any other exception
+                makes the asker try again.
             complete: whether this handler alone answers for all these keys; the router then asks no other.
             workers: number of threads.
             kind: ledger kind of requests and answers.
             beside: a handler that lives longer: its threads answer, and `workers` is not looked at.
+            turn_of: whose a request is, of its key and payload: askers are served in turn; None: by key.
         """
         self._connection.check_open()
         serving = Serving(
-            self._connection, keyexpr, handler, complete=complete, workers=workers, kind=kind, beside=beside
+            self._connection,
+            keyexpr,
+            handler,
+            complete=complete,
+            workers=workers,
+            kind=kind,
+            beside=beside,
+            turn_of=turn_of,
         )
         return self.keep(serving)
 

@@ -18,10 +18,25 @@ QUEUE_LIMIT: Final = 4096
 """How many received messages may wait for a handler, before some are refused or dropped."""
 MAX_SESSIONS: Final = 10_000
 """How many sessions a router accepts."""
+ACCEPT_MS: Final = 5_000
+"""A handshake may take so long, ms: a weak mobile link needs one or two seconds."""
 READS: Final = ("gnd/v1/tile/**", "gnd/v1/tiles/**", "gnd/v1/catalog/**")
 """Keys of questions that change nothing: whose link is full loses the answer, and asks again."""
 QUEUED_BATCHES: Final = 16
 """How many batches a router keeps for each client and each lane (zenoh's most); allocated when needed."""
+
+KIB: Final = 1024
+SIZES: Final = {
+    "gnd/v1/tile/**": 4 * KIB,
+    "gnd/v1/tiles/**": 64 * KIB,
+    "gnd/v1/catalog/**": 4 * KIB,
+    "gnd/v1/state/**": 16 * KIB,
+    "gnd/v1/change/**": 9 * 1024 * KIB,
+}
+"""Bytes of a question on these keys that a router lets in: more than any of them may have, so that what is refused by
+name stays refused by name; a larger one is dropped before it is copied to anybody."""
+PUT_SIZES: Final = {"gnd/v1/traffic/**": 64 * KIB, "gnd/v1/want/**": 256 * KIB, "gnd/v1/update/**": 5 * 1024 * KIB}
+"""Likewise of messages that are put."""
 
 # Knocking at a router that is down costs some 100 bytes a time.
 _RETRY_MS: Final = 200
@@ -165,7 +180,16 @@ def _router_rules() -> dict[str, Any]:
             _rule("notices", ["put", "delete"], ["**"], {"congestion_control": "drop", "priority": "data_low"}),
             _rule("reads", ["query"], list(READS), {"congestion_control": "drop"}),
         ],
+        "low_pass_filter": [
+            *(_size("query", key, size) for key, size in SIZES.items()),
+            *(_size("put", key, size) for key, size in PUT_SIZES.items()),
+        ],
     }
+
+
+def _size(message: str, key: str, size: int) -> dict[str, Any]:
+    name = f"{message} {key}"
+    return {"id": name, "messages": [message], "key_exprs": [key], "flows": ["ingress"], "size_limit": size}
 
 
 def _rule(name: str, messages: list[str], keys: list[str], overwrite: dict[str, str]) -> dict[str, Any]:
@@ -192,6 +216,7 @@ def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/shared_memory/enabled": False,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/unicast/accept_pending": 1000,
+        "transport/unicast/accept_timeout": ACCEPT_MS,
         "transport/unicast/open_timeout": max(100, min(10_000, round(1000 * config.open_timeout_s))),
         # Has no fragmentation.
         "transport/unicast/lowlatency": False,

@@ -10,7 +10,8 @@ BusError
 ├── RequestFailed       no answer before the deadline
 │   └── RequestRefused  the other side answered: never
 ├── SealError           a message whose seal is missing, does not fit or is of the wrong part
-├── NotMine, Refused    raised by handlers: what they say to the asker
+├── NotMine, Refused, Busy
+│                       raised by handlers: what they say to the asker
 └── LedgerError         a ledger file or run folder that cannot be read
 """
 
@@ -56,11 +57,12 @@ class RequestFailed(BusError):
         key: key expression that was asked.
         attempts: how often the request was sent.
         cause: what happened at the last attempt.
+        retry_after_s: how long the other side, being busy, asked to wait, s; 0: it did not.
     """
 
-    def __init__(self, key: str, attempts: int, cause: str) -> None:
+    def __init__(self, key: str, attempts: int, cause: str, retry_after_s: float = 0.0) -> None:
         super().__init__(f"request to {key} failed after {attempts} attempts, last: {cause}")
-        self.key, self.attempts, self.cause = key, attempts, cause
+        self.key, self.attempts, self.cause, self.retry_after_s = key, attempts, cause, retry_after_s
 
 
 class RequestRefused(RequestFailed):
@@ -77,3 +79,16 @@ class NotMine(BusError):
 
 class Refused(BusError):
     """Raised by a handler to say that the request can never succeed; the asker gets `RequestRefused` at once."""
+
+
+class Busy(BusError):
+    """Raised by a handler that has no room for the request now; the asker waits that long, and asks again.
+
+    Attributes:
+        retry_after_s: how long to wait at least, s.
+        reason: a word for the counters.
+    """
+
+    def __init__(self, text: str, retry_after_s: float, reason: str) -> None:
+        super().__init__(text)
+        self.retry_after_s, self.reason = retry_after_s, reason

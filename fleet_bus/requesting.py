@@ -31,6 +31,16 @@ CERTIFICATE_WANTED: Final = "gnd/certificate"
 """Encoding of a reply that says: ask again at once, with your certificate."""
 FAILED: Final = "gnd/failed"
 """Encoding of a reply that says: the handler failed, ask again."""
+BUSY: Final = "gnd/busy"
+"""Encoding of a reply that says: not now. Its payload is "<milliseconds to wait>;<why>"."""
+LONGEST_BUSY_S: Final = 60.0
+"""A longer wait is not believed: who answers falsely shall not silence a vehicle for long."""
+BUSY_SPREAD: Final = 1.5
+"""Who was told to wait waits up to so many times as long, at random: a fleet does not come back in step."""
+
+RETURN_SPREAD_S: Final = 0.4
+"""Questions that have waited for a router go out within so long after it is found, at random: all who have lost a
+router find it again at the same time."""
 
 _REPLY_KIND: Final = {"change": "ack"}
 # Questions about the map are short and urgent; they and their answers pass reports and acknowledgements.
@@ -73,6 +83,7 @@ class RequestAnswers:
     refusal: str | None = None
     announced: int | None = None
     certificate_wanted: bool = False
+    retry_after_s: float = 0.0
 
     def add_error(self, error: zenoh.ReplyError, *, final: bool = True) -> None:
         """Sorts a reply that is not an answer; `final`: a refusal is believed."""
@@ -84,6 +95,10 @@ class RequestAnswers:
         elif encoding == CERTIFICATE_WANTED:
             self.certificate_wanted = True
             self.errors.append(text)
+        elif encoding == BUSY:
+            wait_s, why = _busy_of(text)
+            self.retry_after_s = max(self.retry_after_s, wait_s)
+            self.errors.append(f"busy: {why} (retry after {wait_s:g} s)")
         else:
             self.errors.append(text)
 
@@ -99,6 +114,18 @@ class RequestAnswers:
         if self.ok:
             return f"only {len(self.ok)} of {self.announced or 'an unknown number of'} answers came"
         return "empty reply: nobody serves this key now, or the handler died"
+
+
+def busy_text(retry_after_s: float, why: str) -> str:
+    """Payload of a reply in encoding `BUSY`."""
+    return f"{max(1, round(1000 * retry_after_s))};{why}"
+
+
+def _busy_of(text: str) -> tuple[float, str]:
+    """Seconds to wait and why; of what makes no sense nothing to wait."""
+    number, _, why = text.partition(";")
+    is_number = number.isascii() and number.isdigit() and len(number) < 19
+    return (min(int(number) / 1000, LONGEST_BUSY_S) if is_number else 0.0), why
 
 
 def request(
@@ -154,9 +181,10 @@ class _Asking:
                 continue
             if answers.refusal is not None:
                 raise RequestRefused(self.key, attempt, f"refused: {answers.refusal}")
-            wait_s = retry.wait_s(attempt)
+            wait_s = max(retry.wait_s(attempt), answers.retry_after_s * random.uniform(1.0, BUSY_SPREAD))
             if time.monotonic() + wait_s >= deadline_s:
-                raise RequestFailed(self.key, attempt, f"{answers.cause()} (gave up after {timeout_s:g} s)")
+                cause = f"{answers.cause()} (gave up after {timeout_s:g} s)"
+                raise RequestFailed(self.key, attempt, cause, answers.retry_after_s)
             if self.connection.closed.wait(wait_s):
                 raise BusClosed(f"the bus was closed while asking {self.key} for the {attempt + 1}th time")
         raise AssertionError("unreachable")
@@ -164,8 +192,11 @@ class _Asking:
     def _once(self, timeout_s: float, *, first_only: bool, with_chain: bool) -> RequestAnswers:
         connection = self.connection
         connection.check_open()
+        was_connected = connection.is_connected()
         if not connection.wait_connected(timeout_s):  # nothing would be sent, so nothing is paced nor booked
             return RequestAnswers(errors=[f"no router at {', '.join(connection.config.connect)}"])
+        if not was_connected and connection.closed.wait(random.uniform(0.0, min(RETURN_SPREAD_S, timeout_s / 2))):
+            raise BusClosed(f"the bus was closed while asking {self.key}")
         asked_at_s = time.monotonic()
         attachment, digest = None if first_only else COUNT_WANTED, b""
         if connection.sealing is not None:

@@ -13,6 +13,8 @@ from typing import Final
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from gnd.fleet_bus.guard import USUAL_LIMITS, Address, ConnectionGuard, GuardLimits, address
+from gnd.fleet_bus.part import Part
 
 _LOG = logging.getLogger(__name__)
 _LOOK_UP_S: Final = 0.25
@@ -20,12 +22,15 @@ _LOOK_UP_S: Final = 0.25
 _RECEIVING_THREADS: Final = 16
 
 
-def open_router(listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = ()) -> Bus:
+def open_router(
+    listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = (), limits: GuardLimits | None = None
+) -> Bus:
     """A running router; close it to end it.
 
     Args:
         listen: endpoints to open, "tcp/host:port".
         connect: endpoints of other routers to link with.
+        limits: of connections; by default `USUAL_LIMITS`.
 
     Raises:
         PortInUse: another process listens there.
@@ -34,7 +39,34 @@ def open_router(listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[s
     _raise_file_limit()
     os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVING_THREADS}))")  # read at first use
     config = BusConfig(mode="router", listen=tuple(listen), connect=tuple(connect))
-    return open_bus(config, name="router")
+    bus = open_bus(config, name="router")
+    bus.keep(_Guarding(bus, limits or USUAL_LIMITS))
+    return bus
+
+
+class _Guarding(Part):
+    """The guard of a router's connections, closed with its session."""
+
+    def __init__(self, router: Bus, limits: GuardLimits) -> None:
+        super().__init__()
+        ports = {port for _, port in map(_address, router.config.listen)}
+
+        def sessions() -> set[Address]:
+            return {_address(link.dst) for link in router.connection.session.info.links()}
+
+        self._guard = ConnectionGuard(ports, sessions, limits)
+
+    def _end(self) -> None:
+        self._guard.close()
+
+
+def _address(locator: str) -> Address:
+    """Host and port of "tcp/[::1]:7447#options"; of a name as it is."""
+    host, _, port = locator.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
+    try:
+        return address(host.strip("[]"), int(port))
+    except ValueError:  # a name: of an endpoint to listen at, whose port alone is looked at
+        return host, int(port)
 
 
 def run_router(

@@ -9,6 +9,7 @@ from prometheus_client.registry import Collector
 
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.health import HealthServer
+from gnd.fleet_bus.refusals import show_refusals
 
 
 class _Router(Collector):
@@ -26,4 +27,5 @@ def watch_router(router: Bus, port: int, host: str) -> HealthServer:
     """Metrics and health of a router that runs in this process."""
     registry = CollectorRegistry()
     registry.register(_Router(router))
+    show_refusals(registry)
     return HealthServer(port, registry, {"router": lambda: "it is closed" if router.is_closed else None}, host=host)

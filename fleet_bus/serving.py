@@ -10,12 +10,14 @@ import zenoh
 from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, attachment_bytes, head_bytes
-from gnd.fleet_bus.errors import BusClosed, BusError, NotMine, Refused, SealError
+from gnd.fleet_bus.errors import BusClosed, BusError, Busy, NotMine, Refused, SealError
 from gnd.fleet_bus.part import Part
-from gnd.fleet_bus.requesting import CERTIFICATE_WANTED, COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED
+from gnd.fleet_bus.refusals import counted
+from gnd.fleet_bus.requesting import BUSY, CERTIFICATE_WANTED, COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED, busy_text
 from gnd.fleet_bus.sealing import CertificateWanted
 from gnd.fleet_bus.seals import MARK, Holder, nonce_of, question_digest, wants_count
-from gnd.fleet_bus.workers import Workers
+from gnd.fleet_bus.seldom import Seldom
+from gnd.fleet_bus.turns import InTurn
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,12 +43,18 @@ Answer = bytes | Iterable[tuple[str, bytes]]
 Handler = Callable[[Request], Answer]
 
 
+TurnOf = Callable[[str, bytes], str]
+"""Whose a request is, of its key and payload: called in zenoh's thread, so it has to be short."""
+
 REGIONS_WAITING: Final = 64
+FULL_RETRY_S: Final = 1.0
+"""Who finds a full mailbox is to ask again after so long."""
 # Answers to a region leave no faster, so that they do not fill the queue of an asker with an ordinary link.
 REGION_BYTE_S: Final = 8_000_000
 
 
 _Asked = tuple["Serving", zenoh.Query]
+_FAILURES = Seldom(_LOG)
 
 
 def _answer(asked: _Asked) -> None:
@@ -59,6 +67,7 @@ class Serving(Part):
 
     Questions about regions have one thread and a short mailbox of their own: nobody who asks for one thing waits for
     somebody who asks for everything. One that serves `beside` another has the threads and the mailbox of that one.
+    Within a mailbox askers are served in turn, as `turn_of` tells them apart: by their keys, if nothing else is said.
     """
 
     def __init__(
@@ -71,16 +80,18 @@ class Serving(Part):
         workers: int,
         kind: str,
         beside: "Serving | None" = None,
+        turn_of: TurnOf | None = None,
     ) -> None:
         super().__init__()
+        self._turn_of = turn_of or _key_of
         self._connection, self._handler, self._kind = connection, handler, kind
-        self._own: list[Workers[_Asked]] = []
+        self._own: list[InTurn[_Asked]] = []
         if beside is None:
-            self._own.append(Workers(f"serve {keyexpr}", _answer, workers, QUEUE_LIMIT))
-        self._workers: Workers[_Asked] = self._own[0] if beside is None else beside._workers
+            self._own.append(InTurn(f"serve {keyexpr}", _answer, workers, QUEUE_LIMIT))
+        self._workers: InTurn[_Asked] = self._own[0] if beside is None else beside._workers
         self._regions = self._workers
         if "*" in keyexpr:
-            self._regions = Workers(f"regions {keyexpr}", _answer, 1, REGIONS_WAITING)
+            self._regions = InTurn(f"regions {keyexpr}", _answer, 1, REGIONS_WAITING)
             self._own.append(self._regions)
         self.declare(connection, lambda session: session.declare_queryable(keyexpr, self._accept, complete=complete))
 
@@ -91,10 +102,12 @@ class Serving(Part):
 
     def _accept(self, query: zenoh.Query) -> None:
         # Runs in zenoh's thread: hand over, or say at once that we cannot.
-        workers = self._regions if "*" in str(query.key_expr) else self._workers
-        if not workers.offer((self, query)):
-            with query:
-                query.reply_err(f"busy: {workers.limit} requests are waiting", encoding=FAILED)
+        key = str(query.key_expr)
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        workers = self._regions if "*" in key else self._workers
+        for _, without_room in workers.offer(self._turn_of(key, payload), len(payload), (self, query)):
+            with without_room:
+                _say_busy(without_room, Busy(f"{workers.limit} requests are waiting", FULL_RETRY_S, "mailbox"))
 
     def answer(self, query: zenoh.Query) -> None:
         """Answer one query, in the caller's thread."""
@@ -105,10 +118,15 @@ class Serving(Part):
                 pass  # no reply: another handler gives it, or the asker tries again
             except CertificateWanted as error:
                 query.reply_err(str(error), encoding=CERTIFICATE_WANTED)
+            except Busy as busy:
+                _say_busy(query, busy)
+            except Refused as refusal:  # while a region's answers were made
+                counted("refused", self._kind)
+                query.reply_err(str(refusal), encoding=REFUSED)
             except zenoh.ZError as error:
-                _LOG.warning("%s: cannot reply: %s", query.key_expr, error)
+                _FAILURES.warning("%s: cannot reply: %s", query.key_expr, error)
             except Exception as error:
-                _LOG.exception("handler of %s failed", query.key_expr)
+                _FAILURES.exception("handler of %s failed", query.key_expr)
                 query.reply_err(f"{type(error).__name__}: {error}", encoding=FAILED)
 
     def _reply(self, query: zenoh.Query) -> None:
@@ -146,6 +164,7 @@ class Serving(Part):
 
     def _refuse(self, query: zenoh.Query, key: str, why: str, digest: bytes, attachment: bytes) -> None:
         """Say that there will be no answer, sealed to who looks at seals."""
+        counted("refused", self._kind)
         sealing = self._connection.sealing
         if sealing is None or "*" in key or not attachment.startswith(MARK):
             query.reply_err(why, encoding=REFUSED)
@@ -164,3 +183,12 @@ class Serving(Part):
         self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES) + attachment_bytes(seal))
         with self._connection.sending():
             query.reply(key, payload, attachment=seal)
+
+
+def _say_busy(query: zenoh.Query, busy: Busy) -> None:
+    counted("busy", busy.reason)
+    query.reply_err(busy_text(busy.retry_after_s, str(busy)), encoding=BUSY)
+
+
+def _key_of(key: str, _payload: bytes) -> str:
+    return key

@@ -26,7 +26,8 @@ STEPS: Final = (
     (7, "schema_of_uploads"),
     (8, "schema_of_parameters"),
     (9, "schema_of_new_roads"),
-    (10, "schema_of_trust"),
+    (10, "schema_of_turns"),
+    (11, "schema_of_trust"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 _TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks")

@@ -154,13 +154,20 @@ class SqliteStore:
         """See `Store.put_upload`."""
         return self._writer.run(lambda c: uploads.put(c, upload, home))
 
-    def claim_uploads(self, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
+    def claim_uploads(
+        self, owner: str, n: int, lease_s: float, in_turn: uploads.InTurnOf = sorted
+    ) -> list[UploadClaim]:
         """See `Store.claim_uploads`."""
         # As with tiles: who looks often takes no write lock for nothing.
         with self._readers.snapshot() as c:
             if not uploads.any_claimable(c, owner):
                 return []
-        return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s))
+        return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s, in_turn))
+
+    def uploads_waiting(self, vehicle: str | None, at_most: int) -> int:
+        """See `Store.uploads_waiting`."""
+        with self._readers.snapshot() as c:
+            return uploads.waiting(c, vehicle, at_most)
 
     def postpone_upload(self, claim: UploadClaim, delay_s: float, *, blameless: bool = False) -> None:
         """See `Store.postpone_upload`."""

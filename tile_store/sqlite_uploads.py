@@ -1,7 +1,7 @@
 """Uploads in SQLite: each function runs inside the caller's transaction."""
 
 import secrets
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from hashlib import sha256
 from typing import Any, Final
 
@@ -19,6 +19,12 @@ from gnd.tile_store.values import PutStatus, ReportRow, StoreConfig
 NS_PER_S: Final = 1_000_000_000
 HEAD_START_NS: Final = NS_PER_S
 """So long an upload is left to the shard that received it, which holds its tiles in memory."""
+MOST_TURNS: Final = 4096
+"""Vehicles that are looked at to find whose turn it is."""
+AT_ONCE_OF_VEHICLE: Final = 2
+"""Uploads of one vehicle that are claimed together, at least."""
+InTurnOf = Callable[[list[str]], list[str]]
+"""Brings vehicles into the order of their turns."""
 LONGEST_LEASE_NS: Final = 3600 * NS_PER_S
 """A lease that ends later than this from now was not written by this clock: it counts as ended."""
 
@@ -33,18 +39,35 @@ def put(c: apsw.Connection, upload: Upload, home: str) -> PutStatus:
 
 def any_claimable(c: apsw.Connection, owner: str) -> bool:
     """Whether `claim` would find anything."""
-    return bool(fetch(c, "fresh_uploads", {"home": owner, "n": 1}) or fetch(c, "free_uploads", _clock() | {"n": 1}))
+    free = _clock() | {"n": 1, "attempts": 0}
+    return bool(fetch(c, "any_fresh_upload", {"home": owner}) or fetch(c, "free_uploads", free))
 
 
-def claim(c: apsw.Connection, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
-    """Lease uploads, the oldest first. One that was claimed before comes alone: it may be what ended its worker."""
-    rows = fetch(c, "free_uploads", _clock() | {"n": n})
-    again = [row for row in rows if row[-1] > 0]
-    if again:
-        rows = again[:1]
-    else:
-        rows += fetch(c, "fresh_uploads", {"home": owner, "n": n - len(rows)})
-    return [_lease(c, owner, lease_s, *row) for row in {row[0]: row for row in rows}.values()]
+def waiting(c: apsw.Connection, vehicle: str | None, at_most: int) -> int:
+    """How many uploads wait, of one vehicle only those that nobody has looked at; at most `at_most` are counted."""
+    if vehicle is None:
+        return int(fetch(c, "waiting_of_all", {"n": at_most})[0][0])
+    return int(fetch(c, "waiting_of_vehicle", {"vehicle": vehicle, "n": at_most})[0][0])
+
+
+def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, in_turn: InTurnOf) -> list[UploadClaim]:
+    """Lease uploads of several vehicles in turn, of each the oldest first. One that was claimed before comes alone: it
+    may be what ended its worker.
+    """
+    rows = fetch(c, "free_uploads", _clock() | {"n": 1, "attempts": 1}) or _fresh(c, owner, n, in_turn)
+    return [_lease(c, owner, lease_s, *row) for row in rows]
+
+
+def _fresh(c: apsw.Connection, owner: str, n: int, in_turn: InTurnOf) -> list[Row]:
+    found: list[Row] = []
+    vehicles = [vehicle for (vehicle,) in fetch(c, "turns_of_uploads", {"n": MOST_TURNS})]
+    each = max(AT_ONCE_OF_VEHICLE, n // max(1, len(vehicles)))
+    for vehicle in in_turn(vehicles):
+        wanted = _clock() | {"vehicle": vehicle, "home": owner, "n": min(each, n - len(found))}
+        found += fetch(c, "fresh_uploads", wanted)
+        if len(found) >= n:
+            break
+    return found
 
 
 def _lease(c: apsw.Connection, owner: str, lease_s: float, number: int, *row: Any) -> UploadClaim:

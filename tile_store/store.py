@@ -1,6 +1,6 @@
 """What a store of tiles and reports can do, whatever keeps it. `tests/tile_store/` holds every implementation to it."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -52,8 +52,16 @@ class Store(Protocol):
     def put_upload(self, upload: Upload, home: str) -> PutStatus:
         """Keep a message as it came, received by shard `home`; the same bytes on the same key are a "duplicate"."""
 
-    def claim_uploads(self, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
-        """Lease up to `n` uploads that wait, the oldest first; one that was claimed before comes alone."""
+    def claim_uploads(
+        self, owner: str, n: int, lease_s: float, in_turn: Callable[[list[str]], list[str]] = sorted
+    ) -> list[UploadClaim]:
+        """Lease up to `n` uploads that wait: of the vehicles in the order into which `in_turn` brings them ("":
+        Gaussians, which do not tell whose they are), a few of each, its oldest first; one that was claimed before comes
+        alone.
+        """
+
+    def uploads_waiting(self, vehicle: str | None, at_most: int) -> int:
+        """How many uploads wait, of one vehicle only those that nobody has looked at; at most so many are counted."""
 
     def postpone_upload(self, claim: UploadClaim, delay_s: float, *, blameless: bool = False) -> None:
         """Give an upload back, to be claimed again after `delay_s`; blameless: its attempts until now do not count."""

@@ -21,8 +21,8 @@ from gnd.gnd_map.tile_id import TileId
 U8 = npt.NDArray[np.uint8]
 MAX_VOLUME: Final = 1 << 22
 """Voxels of the box around a tile's Gaussians: 2,700 floors of 39 x 39."""
-MAX_MESSAGE_VOLUME: Final = 1 << 26
-"""Voxels of all boxes of a message: a district of tiles with 50 floors each, a few seconds."""
+MAX_MESSAGE_VOLUME: Final = 1 << 23
+"""Voxels of all boxes of a message: 270 tiles with 20 floors each; reading them takes some 0.2 s."""
 MAX_FLOOR: Final = 100_000
 """As `VoxelGrid` has it."""
 _ANY: Final = number_at(0) + 69  # a context of its own in the room of the first number

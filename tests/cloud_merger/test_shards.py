@@ -128,7 +128,7 @@ def test_a_shard_that_hangs_is_replaced_after_its_lease_and_may_come_back(cloud)
     cloud.signal("left", signal.SIGSTOP)
     for n in range(8):
         assert cloud.send(report_number(n)).status in ("stored", "duplicate")
-    assert cloud.living == {"right"}
+    wait_for("its lease is over", lambda: cloud.living == {"right"})
     cloud.signal("left", signal.SIGCONT)
     wait_for("both live again", lambda: cloud.living == set(SHARDS))
     wait_for("one ack each", lambda: one_ack_each(cloud, range(8, 16)))

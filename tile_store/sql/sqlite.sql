@@ -631,13 +631,35 @@ INSERT INTO upload (sha, key, body, report_id, vehicle, form, received_ns, home,
 VALUES (:sha, :key, :body, :report_id, :vehicle, :form, :received_ns, :home, :boot, :lease_ns)
 ON CONFLICT (sha) DO NOTHING
 
+-- name: turns_of_uploads
+WITH RECURSIVE turn (vehicle) AS (
+  SELECT MIN(vehicle) FROM upload INDEXED BY upload_turn WHERE state = 'waiting' AND attempts = 0
+  UNION ALL
+  SELECT (SELECT MIN(vehicle) FROM upload INDEXED BY upload_turn
+          WHERE state = 'waiting' AND attempts = 0 AND vehicle > turn.vehicle)
+  FROM turn WHERE turn.vehicle IS NOT NULL
+)
+SELECT vehicle FROM turn WHERE vehicle IS NOT NULL LIMIT :n
+
 -- name: fresh_uploads
-SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_fresh
-WHERE state = 'waiting' AND attempts = 0 AND home = :home ORDER BY upload LIMIT :n
+SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_turn
+WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle
+  AND (home = :home OR boot <> :boot OR lease_ns <= :now OR lease_ns > :never)
+ORDER BY upload LIMIT :n
+
+-- name: any_fresh_upload
+SELECT 1 FROM upload INDEXED BY upload_fresh WHERE state = 'waiting' AND attempts = 0 AND home = :home LIMIT 1
+
+-- name: waiting_of_vehicle
+SELECT COUNT(*) FROM (SELECT 1 FROM upload INDEXED BY upload_turn
+                      WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle LIMIT :n)
+
+-- name: waiting_of_all
+SELECT COUNT(*) FROM (SELECT 1 FROM upload INDEXED BY upload_waiting WHERE state = 'waiting' LIMIT :n)
 
 -- name: free_uploads
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_waiting
-WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never)
+WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) AND attempts >= :attempts
 ORDER BY attempts, upload LIMIT :n
 
 -- name: lease_upload
@@ -963,3 +985,7 @@ CREATE TABLE IF NOT EXISTS pardon (
   vehicle  TEXT    NOT NULL PRIMARY KEY,
   until_ns INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
+
+-- name: schema_of_turns
+-- Step of the schema: uploads that nobody has looked at, by vehicle, to look at those of all vehicles in turn.
+CREATE INDEX upload_turn ON upload (vehicle, upload) WHERE state = 'waiting' AND attempts = 0;

@@ -245,9 +245,11 @@ class Outbox:
         with self._db.transaction() as c:
             _whole(c, report_id, reason)
 
-    def failed(self, letter: Letter, now_ns: int, reason: str) -> int:
-        """Record a failed attempt; returns when to try again (ns): 0.5 s doubled each time, at most 15 s."""
-        wait_s = min(FIRST_WAIT_S * 2 ** min(letter.attempts, 8), LONGEST_WAIT_S)
+    def failed(self, letter: Letter, now_ns: int, reason: str, least_s: float = 0.0) -> int:
+        """Record a failed attempt; returns when to try again (ns): 0.5 s doubled each time, at most 15 s, not before
+        `least_s` are over.
+        """
+        wait_s = max(min(FIRST_WAIT_S * 2 ** min(letter.attempts, 8), LONGEST_WAIT_S), least_s)
         next_ns = now_ns + int(wait_s * 1e9)
         sql = "UPDATE report SET attempts = attempts + 1, next_ns = ?, reason = ? WHERE report_id = ?"
         self._db.run(sql, (next_ns, reason, letter.report_id))

@@ -7,12 +7,14 @@ refused.
 """
 
 import logging
+import random
 import threading
 import time
 from collections import Counter
 
 from gnd.fleet_bus.bus import Bus
-from gnd.fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
+from gnd.fleet_bus.errors import BusClosed, MessageTooLarge, RequestFailed, RequestRefused
+from gnd.fleet_bus.requesting import BUSY_SPREAD
 from gnd.gnd_map.errors import CodecError, GndError
 from gnd.schemas.changes import ChangeAck, ChangeReport
 from gnd.schemas.errors import SchemaError
@@ -94,10 +96,20 @@ class SenderThread:
             self._refused(letter, str(error))
         except (CodecError, PackingError) as error:  # no Gaussians can be made of what the outbox holds
             self._go_whole(letter, str(error))
+        except RequestFailed as error:
+            self._failed(letter, error)
         except Exception as error:  # whatever it was: this thread is all that empties the outbox
             self._outbox.failed(letter, time.monotonic_ns(), str(error))
             self.last_error = str(error)
             _log.warning("report %s not acknowledged: %s", letter.report_id, error)
+
+    def _failed(self, letter: Letter, error: RequestFailed) -> None:
+        """Where the cloud says that it is busy, nothing else of this vehicle is sent before that time is over."""
+        wait_s = error.retry_after_s * random.uniform(1.0, BUSY_SPREAD)
+        self._outbox.failed(letter, time.monotonic_ns(), str(error), wait_s)
+        self.last_error = str(error)
+        _log.warning("report %s not acknowledged: %s", letter.report_id, error)
+        self._stop.wait(wait_s)
 
     def _asked(self, letter: Letter) -> tuple[ChangeAck, str]:
         """The answer to the next message of a report, and its form."""

@@ -1,0 +1,229 @@
+"""Who may send how much: looked at before a report is kept, so that nothing is spent on what is beyond a limit.
+
+Each vehicle has a bucket of reports and one of bytes, which fill at a steady rate; so has its owner, where certificates
+tell owners. Without identity a name costs nothing: therefore new names are a bucket of their own, and begin with a part
+of what a vehicle that is known may send at once. What waits to be looked at is bounded for each vehicle and in all, by
+the store, which all shards share. Who is beyond a limit is told how long to wait, and loses nothing.
+"""
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from gnd.fleet_bus.errors import Busy
+from gnd.schemas.upload_head import UploadHead
+from gnd.tile_store.uploads import FirstHalf
+
+MIB: Final = 1024 * 1024
+REPORTS_A_MINUTE: Final = 120.0
+"""Of a vehicle, on the average; one that drives sends some ten."""
+REPORTS_AT_ONCE: Final = 600
+"""A vehicle that was out of reach may send so many at once, ..."""
+NEWCOMER_REPORTS: Final = 120
+"""... one that was never seen so many."""
+BYTES_A_MINUTE: Final = 16.0 * MIB
+BYTES_AT_ONCE: Final = 64.0 * MIB
+OWNER_VEHICLES: Final = 1_000
+"""An owner may send as much as so many vehicles."""
+NAMES_A_MINUTE: Final = 1_200.0
+NAMES_AT_ONCE: Final = 600
+"""New names: after a restart every vehicle is new."""
+REMEMBERED_NAMES: Final = 65_536
+WAITING_OF_VEHICLE: Final = 256
+"""Uploads of a vehicle that nobody has looked at."""
+WAITING_OF_ALL: Final = 20_000
+"""Of all vehicles; half of it is out of reach for names that are new."""
+NONSENSE_A_MINUTE: Final = 120.0
+NONSENSE_AT_ONCE: Final = 240
+"""Messages without a readable head: they name nobody, so all of them share these."""
+WAITING_RETRY_S: Final = 5.0
+LONGEST_RETRY_S: Final = 60.0
+LOOK_EVERY_S: Final = 0.5
+KNOWN_AFTER_S: Final = 30.0
+_MINUTE_S: Final = 60.0
+
+
+class Waiting(Protocol):
+    """What is asked of the store."""
+
+    def uploads_waiting(self, vehicle: str | None, at_most: int) -> int:
+        """See `Store.uploads_waiting`."""
+
+    def first_halves(self, key: str, report_id: str) -> list[FirstHalf]:
+        """See `Store.first_halves`."""
+
+
+class TokenBucket:
+    """So many at once, and so many a minute on the average. Not safe in several threads.
+
+    Args:
+        a_minute: at which it fills.
+        at_once: what it holds.
+        now_s: by a clock that does not step.
+        filled: what it begins with; None: full.
+    """
+
+    __slots__ = ("_at_once", "_level", "_per_s", "_since_s")
+
+    def __init__(self, a_minute: float, at_once: float, now_s: float, filled: float | None = None) -> None:
+        self._per_s, self._at_once, self._since_s = a_minute / _MINUTE_S, at_once, now_s
+        self._level = at_once if filled is None else filled
+
+    def missing_s(self, amount: float, now_s: float) -> float:
+        """How long until so much may be taken, s; 0: now. What is more than it holds may be taken when it is full."""
+        self._level = min(self._at_once, self._level + (now_s - self._since_s) * self._per_s)
+        self._since_s = now_s
+        return max(0.0, (min(amount, self._at_once) - self._level) / self._per_s)
+
+    def take(self, amount: float) -> None:
+        """Take it; call `missing_s` before."""
+        self._level -= amount
+
+
+@dataclass(slots=True)
+class _Account:
+    """Of one name."""
+
+    since_s: float
+    reports: TokenBucket
+    size: TokenBucket
+
+
+class Admission:
+    """Admits uploads or raises `Busy`. Safe in several threads; its memory is bounded whatever names are invented.
+
+    Args:
+        store: knows what waits, of all shards.
+        reports_a_minute: of a vehicle.
+        owner_of: the owner of a vehicle, where certificates tell it; "" where not.
+        clock_s: a clock that does not step, s.
+    """
+
+    def __init__(
+        self,
+        store: Waiting,
+        reports_a_minute: float = REPORTS_A_MINUTE,
+        owner_of: Callable[[str], str] = lambda _vehicle: "",
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._store, self._rate, self._owner_of, self._clock_s = store, reports_a_minute, owner_of, clock_s
+        self._lock = threading.Lock()
+        self._accounts: OrderedDict[str, _Account] = OrderedDict()  # least lately used first
+        self._owners: OrderedDict[str, _Account] = OrderedDict()
+        self._names = TokenBucket(NAMES_A_MINUTE, NAMES_AT_ONCE, clock_s())
+        self._nonsense = TokenBucket(NONSENSE_A_MINUTE, NONSENSE_AT_ONCE, clock_s())
+        self._waiting, self._looked_s = 0, clock_s() - LOOK_EVERY_S
+
+    def __len__(self) -> int:
+        return len(self._accounts)
+
+    def admit(self, key: str, head: UploadHead, size_bytes: int) -> None:
+        """Take one upload out of its vehicle's buckets.
+
+        Raises:
+            Busy: with numbers, and how long to wait.
+            StoreError: the store cannot be read.
+        """
+        vehicle = head.vehicle or self._vehicle_of(key, head.report_id)
+        waiting = self._store.uploads_waiting(head.vehicle, WAITING_OF_VEHICLE) if head.vehicle else 0
+        if waiting >= WAITING_OF_VEHICLE:
+            raise Busy(
+                f"{waiting} uploads of {vehicle} wait to be looked at, the limit is {WAITING_OF_VEHICLE}",
+                WAITING_RETRY_S,
+                "waiting",
+            )
+        in_all = self._in_all()
+        with self._lock:
+            now_s = self._clock_s()
+            account = self._account(vehicle, now_s)
+            self._check_all(in_all, now_s - account.since_s >= KNOWN_AFTER_S)
+            owner = self._owner_of(vehicle)
+            for one in (account, *([self._owner(owner, now_s)] if owner else [])):
+                _check(one, vehicle, size_bytes, now_s)
+                one.reports.take(1)
+                one.size.take(size_bytes)
+
+    def admit_nonsense(self) -> None:
+        """Take one message that cannot be read, and is to be kept in quarantine.
+
+        Raises:
+            Busy: there were too many of late.
+        """
+        with self._lock:
+            missing_s = self._nonsense.missing_s(1, self._clock_s())
+            if missing_s > 0:
+                raise Busy(
+                    f"more than {NONSENSE_A_MINUTE:g} messages a minute that cannot be read",
+                    WAITING_RETRY_S,
+                    "nonsense",
+                )
+            self._nonsense.take(1)
+
+    def _vehicle_of(self, key: str, report_id: str) -> str:
+        """Whose Gaussians these are: only their flags tell. "" where no flags have come."""
+        return next((half.vehicle for half in self._store.first_halves(key, report_id)), "")
+
+    def _in_all(self) -> int:
+        """Uploads that wait, as it was at most half a second ago."""
+        with self._lock:
+            if self._clock_s() - self._looked_s < LOOK_EVERY_S:
+                return self._waiting
+            self._looked_s = self._clock_s()
+        self._waiting = self._store.uploads_waiting(None, WAITING_OF_ALL)
+        return self._waiting
+
+    def _check_all(self, in_all: int, is_known: bool) -> None:
+        limit = WAITING_OF_ALL if is_known else WAITING_OF_ALL // 2
+        if in_all >= limit:
+            raise Busy(
+                f"{in_all} uploads wait to be looked at, the limit is {limit}", WAITING_RETRY_S, "waiting in all"
+            )
+
+    def _account(self, vehicle: str, now_s: float) -> _Account:
+        account = self._accounts.get(vehicle)
+        if account is not None:
+            self._accounts.move_to_end(vehicle)
+            return account
+        missing_s = self._names.missing_s(1, now_s)
+        if missing_s > 0:
+            raise Busy(f"more than {NAMES_A_MINUTE:g} new vehicles a minute", WAITING_RETRY_S, "names")
+        self._names.take(1)
+        return _kept(self._accounts, vehicle, self._new(now_s, 1, NEWCOMER_REPORTS))
+
+    def _owner(self, owner: str, now_s: float) -> _Account:
+        if owner in self._owners:
+            self._owners.move_to_end(owner)
+            return self._owners[owner]
+        return _kept(self._owners, owner, self._new(now_s, OWNER_VEHICLES, REPORTS_AT_ONCE))
+
+    def _new(self, now_s: float, vehicles: int, filled: int) -> _Account:
+        return _Account(
+            now_s,
+            TokenBucket(vehicles * self._rate, vehicles * REPORTS_AT_ONCE, now_s, vehicles * filled),
+            TokenBucket(vehicles * BYTES_A_MINUTE, vehicles * BYTES_AT_ONCE, now_s),
+        )
+
+
+def _kept(accounts: "OrderedDict[str, _Account]", name: str, account: _Account) -> _Account:
+    accounts[name] = account
+    if len(accounts) > REMEMBERED_NAMES:
+        accounts.popitem(last=False)
+    return account
+
+
+def _check(account: _Account, vehicle: str, size_bytes: int, now_s: float) -> None:
+    missing_s = account.reports.missing_s(1, now_s)
+    if missing_s > 0:
+        raise Busy(f"{vehicle} has sent too many reports of late", _bounded(missing_s), "reports")
+    missing_s = account.size.missing_s(size_bytes, now_s)
+    if missing_s > 0:
+        raise Busy(
+            f"{vehicle} has sent too many bytes of late, these {size_bytes} are more", _bounded(missing_s), "bytes"
+        )
+
+
+def _bounded(missing_s: float) -> float:
+    return min(max(missing_s, 0.1), LONGEST_RETRY_S)
