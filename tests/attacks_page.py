@@ -11,8 +11,8 @@ PAGE = ROOT / "docs" / "attacks.md"
 HEAD = """# Attacks that are tried
 
 Each line is a test that tries the attack against real processes, or real sessions through a real router, and fails when
-it succeeds (`pytest tests/attacks`). The page is made from the tests by `python tests/attacks_page.py`. What is defended, and
-what is left, is on [security](security.md).
+it succeeds (`pytest tests/attacks`). The page is made from the tests: `python tests/attacks_page.py`. What is defended,
+and what is left, is on [security](security.md).
 
 """
 
