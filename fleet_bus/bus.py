@@ -1,7 +1,7 @@
 """The bus as the rest of the project sees it: the only door to zenoh."""
 
 import threading
-from typing import Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from gnd.fleet_bus import leftovers, requesting, subscribing
 from gnd.fleet_bus.config import BusConfig
@@ -21,6 +21,9 @@ from gnd.fleet_bus.subscribing import (
 )
 from gnd.fleet_bus.wire import WireBytes
 from gnd.gnd_map.tile_id import TileId
+
+if TYPE_CHECKING:
+    from gnd.fleet_bus.identity.renewal import CertificateWatch
 
 _DEFAULT_RETRY = RetryPolicy()
 PUBLISH_WAIT_S: Final = 10.0
@@ -249,6 +252,11 @@ class Bus:
     def wait_connected(self, timeout_s: float) -> bool:
         """Waits for a router; False when there is none in time. Raises `BusClosed` when closed meanwhile."""
         return self._connection.wait_connected(timeout_s)
+
+    @property
+    def certificate(self) -> "CertificateWatch | None":
+        """The certificate that this session shows, None without TLS."""
+        return self._connection.certificate
 
     @property
     def is_closed(self) -> bool:
