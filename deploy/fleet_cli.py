@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 import click
 from rich.console import Console
 
-from gnd.deploy.fleet_identities import make_identities
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
+from gnd.deploy.fleet_identities import make_identities
 from gnd.deploy.next_commands import after_fleet
 from gnd.deploy.ports import claim_port
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
