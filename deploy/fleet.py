@@ -130,17 +130,18 @@ def start_cloud(supervisor: Supervisor, config: FleetConfig, folder: RunFolder, 
     for carrier in site.carriers:
         supervisor.start(carrier)
     for spec in cloud_processes(config, folder, site):
-        supervisor.start(replace(spec, identity=site.identity_of(spec.name)))
+        supervisor.start(spec)
 
 
 def cloud_processes(config: FleetConfig, folder: RunFolder, site: SiteFrame) -> list[ProcessSpec]:
     """Return the processes of the cloud in the order of their start."""
     connect, where = site.connect, site.namespace
     shards = [shard_config(config, f"shard-{number}", folder.store, connect) for number in range(config.shards)]
-    return [
+    specs = [
         *roles.of_cloud(site.listen, connect, folder.store, shards, where),
         ProcessSpec("watcher", roles.watcher, (connect, folder.updates, config.layers), namespace=where),
     ]
+    return [replace(spec, identity=site.identity_of(spec.name)) for spec in specs]
 
 
 def agent_processes(

@@ -27,7 +27,12 @@ class DelayRelay:
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._loop.call_soon_threadsafe(self._end)
+
+    def _end(self) -> None:
+        for task in asyncio.all_tasks(self._loop):
+            task.cancel()
+        self._loop.call_soon(self._loop.stop)
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
@@ -44,7 +49,7 @@ class DelayRelay:
 
     async def _pass(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter, direction: str) -> None:
         rate, free_s = self._link.rate_byte_s(direction), 0.0
-        with suppress(OSError):
+        with suppress(OSError, asyncio.CancelledError):
             while data := await source.read(1400):
                 free_s = max(self._loop.time(), free_s) + len(data) / rate
                 self._loop.call_at(free_s + self._link.delay_s, sink.write, data)
