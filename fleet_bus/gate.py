@@ -22,7 +22,7 @@ import zenoh
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusConfigError, IdentityError, PortInUse
-from gnd.fleet_bus.identity.folder import MEMBERS, Identity
+from gnd.fleet_bus.identity.folder import MEMBERS, MemberIdentity
 from gnd.fleet_bus.identity.following import take_revoked
 from gnd.fleet_bus.identity.lists import MemberList, replace_file
 from gnd.fleet_bus.identity.renewal import CertificateWatch
@@ -233,12 +233,12 @@ class SecureRouter:
         except OSError as error:
             _LOG.warning("list %d is not kept for the next start: %s", self.members.number, error)
 
-    def _check(self, identity: Identity) -> None:
+    def _check(self, identity: MemberIdentity) -> None:
         if identity.role != "router":
             raise IdentityError(f"{self._folder} is the identity of {identity.member.common_name}, not of a router")
 
 
-def read_members(identity: Identity) -> MemberList:
+def read_members(identity: MemberIdentity) -> MemberList:
     """The list of members in an identity folder; `IdentityError` where there is none, or not of its authority."""
     path = identity.folder / MEMBERS
     try:

@@ -4,8 +4,8 @@ Everything is denied but what stands here. zenoh knows a member by the common na
 so that what is a member's own (its state, its reports' notices, its sensors) needs a rule a member. An allowed key must
 include the key of a message: a subscription to `gnd/v1/**` is included by none of them, and so denied.
 
-"ingress" is what a router receives from a member, "egress" what it passes on to one. Egress rules go by role: nothing is
-passed on that was not subscribed to or asked for, and that is checked on the way in.
+"ingress" is what a router receives from a member, "egress" what it passes on to one. Egress rules go by role:
+nothing is passed on that was not subscribed to or asked for, and that is checked on the way in.
 """
 
 from collections.abc import Iterable
@@ -142,7 +142,7 @@ def _own_rights(member: MemberName) -> tuple[Right, ...]:
 
 
 def access_control(members: Iterable[MemberName], *, links: bool = False) -> dict[str, Any]:
-    """zenoh's `access_control` for a router.
+    """The `access_control` of zenoh for a router.
 
     Args:
         members: who belongs; anybody else may do nothing.

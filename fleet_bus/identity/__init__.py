@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE, ROLES, MemberName
 
 if TYPE_CHECKING:
-    from gnd.fleet_bus.identity.folder import Identity, load_identity
+    from gnd.fleet_bus.identity.folder import MemberIdentity, load_identity
 
-__all__ = ["IDENTITY_VARIABLE", "ROLES", "Identity", "MemberName", "load_identity"]
+__all__ = ["IDENTITY_VARIABLE", "ROLES", "MemberIdentity", "MemberName", "load_identity"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("Identity", "load_identity"):
+    if name in ("MemberIdentity", "load_identity"):
         from gnd.fleet_bus.identity import folder
 
         return getattr(folder, name)

@@ -13,7 +13,7 @@ from gnd.fleet_bus.errors import IdentityError
 
 PROBE_S: Final = 3.0
 _ANSWER_S: Final = 1.0
-"""In TLS 1.3 a server says that it does not like a client's certificate only after the handshake: so long it is heard."""
+"""In TLS 1.3 a server refuses a client's certificate only after the handshake: so long it is listened to."""
 _ALERTS: Final = {
     "CERTIFICATE_EXPIRED": "our certificate counts as expired or not yet valid there: compare both clocks",
     "UNKNOWN_CA": "our certificate does not come from the authority that is trusted there",

@@ -1,6 +1,7 @@
 """An identity folder: certificate.pem, key.pem, authority.pem, and where known revoked.pem and members.json."""
 
 import datetime as dt
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -24,7 +25,7 @@ _SOON: Final = 1 / 4
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class MemberIdentity:
     """What an identity folder holds; it has been checked.
 
     Attributes:
@@ -86,7 +87,7 @@ def utc_now() -> dt.datetime:
     return dt.datetime.now(dt.UTC)
 
 
-def load_identity(folder: Path) -> Identity:
+def load_identity(folder: Path) -> MemberIdentity:
     """Reads and checks an identity folder. Validity in time is not checked here: `problems` does.
 
     Raises:
@@ -101,10 +102,10 @@ def load_identity(folder: Path) -> Identity:
         raise IdentityError(f"{folder / KEY} is the key of another certificate than {folder / CERTIFICATE}")
     member = member_of(own)
     _check_chain(folder, chain, authority)
-    return Identity(folder, member, _attribute(own, NameOID.ORGANIZATION_NAME), chain, key, authority)
+    return MemberIdentity(folder, member, _attribute(own, NameOID.ORGANIZATION_NAME), chain, key, authority)
 
 
-def problems(identity: Identity, now: dt.datetime | None = None) -> list[str]:
+def problems(identity: MemberIdentity, now: dt.datetime | None = None) -> list[str]:
     """What keeps an identity from being accepted right now, a sentence each; empty = nothing."""
     now, found = now or utc_now(), []
     name = f"certificate {identity.member.common_name} in {identity.folder}"
@@ -123,7 +124,7 @@ def problems(identity: Identity, now: dt.datetime | None = None) -> list[str]:
     return found
 
 
-def is_revoked(identity: Identity) -> bool:
+def is_revoked(identity: MemberIdentity) -> bool:
     """Whether the list of the revoked beside the certificate names it; False where there is no list."""
     path = identity.folder / REVOKED
     if not path.exists():
@@ -160,7 +161,7 @@ def is_issued_by(certificate: x509.Certificate, issuer: x509.Certificate) -> boo
 
 
 def _check_chain(folder: Path, chain: tuple[x509.Certificate, ...], roots: tuple[x509.Certificate, ...]) -> None:
-    for one, issuer in zip(chain, chain[1:], strict=False):
+    for one, issuer in itertools.pairwise(chain):
         if not is_issued_by(one, issuer):
             raise IdentityError(f"{folder / CERTIFICATE}: {_of(one)} was not issued by {_of(issuer)}, which follows it")
     if not any(is_issued_by(chain[-1], root) for root in roots):

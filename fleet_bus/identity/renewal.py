@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from gnd.fleet_bus.errors import IdentityError
-from gnd.fleet_bus.identity.folder import CERTIFICATE, Identity, load_identity
+from gnd.fleet_bus.identity.folder import CERTIFICATE, MemberIdentity, load_identity
 
 LOOK_S: Final = 5.0
 _SAY_S: Final = 3600.0
@@ -31,7 +31,7 @@ class CertificateWatch:
     """
 
     def __init__(
-        self, folder: Path, on_renewed: Callable[[Identity], None], name: str, every_s: float = LOOK_S
+        self, folder: Path, on_renewed: Callable[[MemberIdentity], None], name: str, every_s: float = LOOK_S
     ) -> None:
         self._folder, self._on_renewed, self._name, self._every_s = folder, on_renewed, name, every_s
         self.identity = load_identity(folder)

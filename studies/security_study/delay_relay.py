@@ -1,4 +1,4 @@
-"""A relay that gives a connection the delay and the rates of a mobile link (no loss), for studies without namespaces."""
+"""A relay that gives a connection the delay and the rates of a mobile link (no loss), where there are no namespaces."""
 
 import asyncio
 import threading

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import click
 import numpy as np
-from studies.security_study.delay_relay import DelayRelay
 
 from gnd.deploy.fleet_identities import make_identities
 from gnd.deploy.ports import claim_port
@@ -25,6 +24,7 @@ from gnd.fleet_bus.gate import SecureRouter
 from gnd.fleet_bus.identity.authority import Authority
 from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.links import load_link
+from studies.security_study.delay_relay import DelayRelay
 
 CONNECTS: Final = 20
 SESSIONS: Final = 300

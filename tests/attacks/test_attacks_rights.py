@@ -242,7 +242,8 @@ def test_a_new_member_gets_in_without_a_restart(place: Scene) -> None:
 
 def test_router_prints_its_rights(place: Scene, tmp_path: Path) -> None:
     """`gnd router --acl` prints what zenoh is given: default deny, and no rule for somebody who is no member."""
-    command = [sys.executable, "-m", "gnd.deploy.cli", "router", "--acl", "--identity", str(place.folder("router.main"))]
+    identity = str(place.folder("router.main"))
+    command = [sys.executable, "-m", "gnd.deploy.cli", "router", "--acl", "--identity", identity]
     rights = json.loads(subprocess.run(command, capture_output=True, check=True, text=True, cwd=tmp_path).stdout)
     assert rights["default_permission"] == "deny"
     assert {"vehicle.a", "shard.shard-0", "tiles.store"} <= {one["id"] for one in rights["subjects"]}
