@@ -11,7 +11,7 @@ from gnd.deploy.errors import DeployError
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import IdentityError
-from gnd.fleet_bus.identity.names import ROLES, MemberName
+from gnd.fleet_bus.identity.names import ROLES, MemberName, identity_of_environment
 from gnd.schemas.keys import authority_key
 
 PATH = click.Path(path_type=Path)
@@ -173,8 +173,8 @@ def _publish(authority: Any, folders: tuple[Path, ...], connect: str | None, ide
     authority.copy_lists(folders)
     if connect is None:
         return
-    given = {} if identity is None else {"identity": identity}
-    with open_bus(BusConfig(connect=(connect,), **given), name="certs") as bus:
+    config = BusConfig(connect=(connect,), identity=identity or identity_of_environment())
+    with open_bus(config, name="certs") as bus:
         for name, data in zip(("members", "revoked"), authority.lists(), strict=True):
             bus.publish(authority_key(name), data, kind="control")
     click.echo(f"told {connect}")

@@ -125,9 +125,18 @@ class SecureRouter:
                 stop_listening(self._ports)
                 self._cut_revoked()
             self._keep(data)
-            if old.members != new.members:
-                self._open_generation()
             return True
+
+    def _catch_up(self) -> None:
+        """Opens a session with the rights of now, unless the newest has them; tried again where it fails."""
+        with self._lock:
+            if not self._closed.is_set() and self._generations[-1].names != self._names():
+                self._open_generation()
+
+    def _names(self) -> frozenset[str]:
+        """Common names of all that have rights: this router, too."""
+        own = self.certificate.identity.member
+        return frozenset(one.common_name for one in self.members.members | {own})
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -144,6 +153,7 @@ class SecureRouter:
             self._take(heard, "heard on the bus")
         with contextlib.suppress(OSError):
             self._take((self._folder / MEMBERS).read_bytes(), f"in {self._folder}")
+        self._catch_up()
         with self._lock:
             if self._closed.is_set():
                 return
@@ -193,8 +203,7 @@ class SecureRouter:
             if self._generations:
                 stop_listening(self._ports)
             bus = _opened(config, takes_over=bool(self._generations))
-            names = frozenset(one.common_name for one in members)
-            self._generations.append(_Generation(bus, socket, names, self._on_list))
+            self._generations.append(_Generation(bus, socket, self._names(), self._on_list))
 
     def _send_away(self, old: "_Generation") -> None:
         cut({_ends(link) for link in old.links()})
