@@ -33,7 +33,7 @@ from gnd.fleet_bus.subscribing import OnMessage
 LOOK_S: Final = 0.5
 """How often the list of members and the links are looked at."""
 GENERATIONS: Final = 3
-"""So many router sessions live at once; before another comes, the clients of the oldest are sent to the newest."""
+"""So many router sessions keep their clients; those of an older one are sent to the newest."""
 _TRIES: Final = 40
 _TRY_S: Final = 0.05
 _SAY_S: Final = 60.0
@@ -187,9 +187,6 @@ class SecureRouter:
     def _open_generation(self) -> None:
         """Opens a session with the rights of now; it takes over the ports, and the others keep their connections."""
         with self._lock:
-            while len(self._generations) >= GENERATIONS:
-                self._send_away(self._generations[0])
-                self._generations.pop(0).close()
             self._number += 1
             socket = f"unixsock-stream/{self._sockets / str(self._number)}"
             members = self.members.members | {self.certificate.identity.member}
@@ -204,9 +201,8 @@ class SecureRouter:
                 stop_listening(self._ports)
             bus = _opened(config, takes_over=bool(self._generations))
             self._generations.append(_Generation(bus, socket, self._names(), self._on_list))
-
-    def _send_away(self, old: "_Generation") -> None:
-        cut({_ends(link) for link in old.links()})
+            for old in self._generations[:-GENERATIONS]:
+                cut({_ends(link) for link in old.links()})  # its clients come to the newest; then it is closed
 
     def _on_renewed(self) -> None:
         with self._lock:

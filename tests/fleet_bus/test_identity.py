@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,7 @@ from gnd.fleet_bus.identity.folder import load_identity, problems
 from gnd.fleet_bus.identity.lists import MemberList, load_revoked
 from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.identity.renewal import CertificateWatch
+from gnd.fleet_bus.router_metrics import watch_router
 
 VEHICLE, ROUTER, STORE = MemberName("vehicle", "v-1"), MemberName("router", "r"), MemberName("tiles", "store")
 TILE = "gnd/v1/tile/ndt/13033/03021/21000/00000"
@@ -171,6 +173,31 @@ def test_a_renewed_certificate_is_taken_by_a_running_client(authority: Authority
         assert vehicle.connections == 2
         assert vehicle.certificate is not None
         assert vehicle.certificate.identity.certificate != before
+
+
+@pytest.mark.slow
+def test_sessions_of_a_router_take_over_from_each_other(authority: Authority, tmp_path: Path) -> None:
+    """Six new members, one after the other: the clients of the oldest sessions are sent to the newest, and go on."""
+    for member, name in ((ROUTER, "r"), (VEHICLE, "v"), (STORE, "s")):
+        authority.issue(member, tmp_path / name)
+    authority.copy_lists([tmp_path / "r"])
+    endpoint = f"tls/127.0.0.1:{new_port()}"
+    with SecureRouter((endpoint,), (), tmp_path / "r") as router, ExitStack() as stack:
+        pages = stack.enter_context(watch_router(router, 0, "127.0.0.1"))
+        store = stack.enter_context(open_bus(BusConfig(connect=(endpoint,), identity=tmp_path / "s")))
+        first = stack.enter_context(open_bus(BusConfig(connect=(endpoint,), identity=tmp_path / "v")))
+        store.serve("gnd/v1/tile/**", lambda request: request.payload)
+        for n in range(6):
+            authority.issue(MemberName("vehicle", f"new-{n}"), tmp_path / f"new-{n}")
+            authority.copy_lists([tmp_path / "r"])
+            new = stack.enter_context(open_bus(BusConfig(connect=(endpoint,), identity=tmp_path / f"new-{n}")))
+            assert new.request(TILE, b"new", kind="tile", timeout_s=30) == b"new"
+            assert first.request(TILE, b"old", kind="tile", timeout_s=30) == b"old"
+        assert 1 < first.connections <= 7
+        metrics = pages.page("/metrics")[2].decode()
+        assert "gnd_certificate_left_seconds" in metrics
+        assert 'gnd_router_sessions{kind="client"}' in metrics
+        assert pages.page("/healthz")[0] == 200
 
 
 def test_the_end_of_a_certificate_is_announced(
