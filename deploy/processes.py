@@ -22,6 +22,7 @@ from typing import Any, Final
 
 from gnd.deploy.errors import ProcessDied
 from gnd.deploy.lab.namespaces import enter_namespace
+from gnd.fleet_bus.config import PLAIN_VARIABLE
 from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE
 
 PRELOAD: Final = ("gnd.deploy.preload",)
@@ -213,6 +214,7 @@ def _run_role(spec: ProcessSpec, log_path: str) -> None:
     try:
         if spec.namespace is not None:
             enter_namespace(spec.namespace)  # before any thread of Zenoh's: threads are born where their maker is
+            os.environ[PLAIN_VARIABLE] = "1"  # a lab's namespaces reach nobody else
         if spec.identity is not None:
             os.environ[IDENTITY_VARIABLE] = str(spec.identity)  # for the processes that it starts, too
         spec.role(*spec.args, stop=stop)

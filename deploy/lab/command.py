@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from gnd.deploy.lab.tools import check_rights
 from gnd.deploy.run_folder import create_run_folder, default_run_path
 from gnd.deploy.source import Source
 from gnd.extras import need_all
-from gnd.fleet_bus.config import PLAIN_VARIABLE
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.gnd_map.settings import settings_text
 
@@ -74,7 +72,6 @@ def lab(
     source = Source(drives, base_map, worlds, config.agents)
     check_rights()
     end_on_sigterm()
-    os.environ.setdefault(PLAIN_VARIABLE, "1")  # the lab's namespaces reach nobody else
     with open_lab(name, parsed, relay_all=relay_all) as opened:
         folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
         write_settings(config, folder.root)

@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +23,8 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusError
 from gnd.fleet_bus.gate import SecureRouter
 from gnd.fleet_bus.identity.authority import Authority
+from gnd.fleet_bus.identity.folder import MEMBERS
+from gnd.fleet_bus.identity.lists import MemberList, replace_file
 from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.links import load_link
 from studies.security_study.delay_relay import DelayRelay
@@ -32,7 +35,7 @@ THREADS: Final = 8
 EXCHANGES: Final = 200
 PAYLOAD: Final = bytes(200)
 """Of a question and of its answer: about what a steady vehicle sends in a message."""
-ROUNDS: Final = 5
+ROUNDS: Final = 3
 TILE: Final = "gnd/v1/tile/ndt/13033/03021/21000/00000"
 
 
@@ -137,11 +140,13 @@ def _acts(root: Path, members: int) -> dict[str, float]:
         authority.issue(member, root / member.name)
     endpoint = f"tls/127.0.0.1:{claim_port(0)}"
     (root / "r").rename(folder)
-    shut_s, in_s, open_s = [], [], []
+    shut_s, in_s = [], []
     _publish(authority, folder, extra)
-    began_s = time.perf_counter()
+    began_s, before_mb = time.perf_counter(), _memory_mb()
     with SecureRouter((endpoint,), (), folder), open_bus(_client(endpoint, root / "store")) as store:
-        open_s.append(time.perf_counter() - began_s)
+        open_s = time.perf_counter() - began_s
+        opened_mb = _memory_mb() - before_mb
+        connect_ms = 1e3 * float(np.median([_connect_s(_client(endpoint, root / "store")) for _ in range(CONNECTS)]))
         store.serve("gnd/v1/tile/**", lambda _request: PAYLOAD)
         for n in range(ROUNDS):
             name = MemberName("vehicle", f"new-{n}")
@@ -157,10 +162,17 @@ def _acts(root: Path, members: int) -> dict[str, float]:
                 shut_s.append(_last_answer_s(vehicle, began_s))
     return {
         "members": float(members),
-        "router_opens_s": open_s[0],
+        "router_opens_s": open_s,
+        "router_opens_mb": opened_mb,
+        "connect_median_ms": connect_ms,
         "let_in_max_s": max(in_s),
         "last_answer_after_revoking_max_s": max(shut_s),
     }
+
+
+def _memory_mb() -> float:
+    """Resident memory of this process, MB (Linux)."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def _client(endpoint: str, folder: Path) -> BusConfig:
@@ -169,11 +181,6 @@ def _client(endpoint: str, folder: Path) -> BusConfig:
 
 def _publish(authority: Authority, folder: Path, extra: frozenset[MemberName]) -> None:
     """The lists of an authority that has so many more members (whose certificates are not made for this)."""
-    from dataclasses import replace
-
-    from gnd.fleet_bus.identity.folder import MEMBERS
-    from gnd.fleet_bus.identity.lists import MemberList, replace_file
-
     listed = MemberList.decode(authority.lists()[0], (authority.certificate,))
     data = replace(listed, members=listed.members | extra).encode(authority._key)
     replace_file(folder / MEMBERS, data)
