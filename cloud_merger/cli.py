@@ -12,6 +12,7 @@ from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.merger import run_shard
 from gnd.cloud_merger.statements import Mode
 from gnd.fleet_bus.health_options import metrics_options
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.settings_file import load_settings
 from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import settings_text
@@ -24,6 +25,7 @@ from gnd.gnd_map.settings import settings_text
 @click.option("--mode", type=click.Choice(get_args(Mode)), help="How votes are counted.  [default: default]")
 @settings_options
 @metrics_options
+@identity_option
 def merger(
     shard_id: str | None,
     store_path: str | None,

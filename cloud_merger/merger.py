@@ -23,8 +23,10 @@ from gnd.cloud_merger.warm import warm_up
 from gnd.cloud_merger.work import Worker, in_turn
 from gnd.cloud_merger.worker_process import Address, worker_process
 from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.certificate_metrics import certificate_checks, register_certificate
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.health import HealthServer
+from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.refusals import RefusalsTold, show_refusals
 from gnd.tile_store.errors import StoreClosed, StoreError
 from gnd.tile_store.metrics import store_checks
@@ -69,6 +71,7 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
             # look at the outside, keep the bytes
             ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission)
             members = Members(config.shard_id)
+            follow_revoked(bus)
             States(store, bus).open()
             reception = Reception(bus, members, ingest.answer, store.release, KnownShards(store).has)
             reception.open()
@@ -105,7 +108,9 @@ def run_worker(
         show_refusals(metrics.registry)
         if metrics_at is not None:
             host, port = metrics_at
-            stack.enter_context(HealthServer(port, metrics.registry, store_checks(store, bus), host=host))
+            register_certificate(metrics.registry, bus.certificate)
+            checks = {**store_checks(store, bus), **certificate_checks(bus.certificate)}
+            stack.enter_context(HealthServer(port, metrics.registry, checks, host=host))
         members, wake = following(bus, config.shard_id), threading.Event()
 
         # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.

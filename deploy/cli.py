@@ -44,6 +44,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "gnd.deploy.reproduce:benchmark",
         "Export worlds as files, and score any program that finds their changes.",
     ),
+    "certs": ("gnd.deploy.certs_cli:certs", "Issue, renew and revoke the certificates of a fleet."),
     "router": ("gnd.fleet_bus.cli:router", "Run the Zenoh router alone."),
     "store": ("gnd.tile_store.cli:store", "Run the tile server alone."),
     "merger": ("gnd.cloud_merger.cli:merger", "Run one merger shard alone."),

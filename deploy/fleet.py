@@ -89,14 +89,15 @@ def run_fleet(
         DeployError: a process cannot be kept alive, the port is taken, or the deadline has passed.
     """
     started_s = time.monotonic()
-    site = site or loopback_site(config, len(prepared.agent_drives))
+    site = site or loopback_site(config, len(prepared.agent_drives), prepared.identities)
     links = {vehicle_name(n): load_link(place.link) for n, place in enumerate(site.vehicles)}
     state = FleetState(links=links, ledgers=LiveLedgers(folder.root))
     with ExitStack() as stack:
         supervisor = stack.enter_context(supervised(folder, state))
         start_cloud(supervisor, config, folder, site)
         opened = stack.enter_context(SqliteStore(folder.store))
-        bus = stack.enter_context(open_bus(BusConfig(connect=(site.connect,)), name="fleet"))
+        own = BusConfig(connect=(site.connect,), identity=site.identity_of("fleet"))
+        bus = stack.enter_context(open_bus(own, name="fleet"))
         stack.enter_context(bus.subscribe(traffic_keys(), state.on_traffic))
         view = stack.enter_context(live_view(state, console))
         run = _FleetRun(
@@ -136,10 +137,11 @@ def cloud_processes(config: FleetConfig, folder: RunFolder, site: SiteFrame) -> 
     """Return the processes of the cloud in the order of their start."""
     connect, where = site.connect, site.namespace
     shards = [shard_config(config, f"shard-{number}", folder.store, connect) for number in range(config.shards)]
-    return [
+    specs = [
         *roles.of_cloud(site.listen, connect, folder.store, shards, where),
         ProcessSpec("watcher", roles.watcher, (connect, folder.updates, config.layers), namespace=where),
     ]
+    return [replace(spec, identity=site.identity_of(spec.name)) for spec in specs]
 
 
 def agent_processes(
@@ -151,7 +153,8 @@ def agent_processes(
         name = vehicle_name(number)
         departure = Departure(folder.clock, number, prepared.starts_s[number]) if prepared.starts_s else None
         agent = replace(agent_config(config, name, drive, folder, place), departure=departure)
-        specs.append(ProcessSpec(name, roles.agent, (agent,), namespace=place.namespace))
+        identity = site.identity_of(name)
+        specs.append(ProcessSpec(name, roles.agent, (agent,), namespace=place.namespace, identity=identity))
     return specs
 
 

@@ -15,6 +15,7 @@ import click
 from rich.console import Console
 
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
+from gnd.deploy.fleet_identities import make_identities
 from gnd.deploy.next_commands import after_fleet
 from gnd.deploy.ports import claim_port
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
@@ -30,6 +31,8 @@ from gnd.gnd_map.settings import settings_text
 PATH = click.Path(path_type=Path)
 
 
+_PLAIN = "the bus of this run is plain, on this machine's loopback interface alone (--secure: TLS and rights)"
+_SECURE = "every process of this run has a certificate of its own: TLS and rights by role, on the loopback interface"
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
@@ -98,8 +101,12 @@ def run_options(command: _Command) -> _Command:
 @click.option(
     "--made-up", type=click.IntRange(min=0), default=0, help="Made-up boxes to put into the scans of --drives."
 )
+@click.option(
+    "--secure", is_flag=True, help="Certificates for all, made on the fly; TLS and rights by role on the bus."
+)
 @run_options
 def fleet(
+    secure: bool,
     drives: tuple[Path, ...],
     base_map: Path | None,
     made_up: int,
@@ -131,7 +138,9 @@ def fleet(
     write_settings(config, folder.root)
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
     source = _imported(source, folder, quiet=as_json)
-    summary = run(config, folder, source, keep_drives=keep_drives)
+    if not as_json:
+        click.echo(_SECURE if secure else _PLAIN, err=True)
+    summary = run(config, folder, source, keep_drives=keep_drives, secure=secure)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
     if base_map is not None and not as_json:
         for line in after_fleet(summary, base_map, folder):
@@ -160,6 +169,7 @@ def run(
     source: Source,
     *,
     keep_drives: bool,
+    secure: bool = False,
     place: Callable[[], AbstractContextManager[SiteFrame | None]] = nullcontext,
 ) -> dict[str, Any]:
     """Prepare and run a fleet and write its summary.
@@ -169,6 +179,7 @@ def run(
         folder: where the run writes.
         source: drives and map.
         keep_drives: keep simulated drives.
+        secure: give every process a certificate, and the bus TLS and rights.
         place: gives the site while the processes run; by default all run on the loopback interface.
 
     Returns:
@@ -195,6 +206,9 @@ def run(
             prepared = prepare.prepare(config, folder, source, progress)
             warm.join()
         progress.update(compiling, visible=False)
+    if secure:
+        identities = make_identities(folder.root, config.shards, len(prepared.agent_drives))
+        prepared = dataclasses.replace(prepared, identities=identities)
     prepare_s = time.monotonic() - started_s
     with place() as site:
         outcome = run_fleet(config, folder, prepared, console, stop, site)

@@ -16,6 +16,7 @@ import click
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.ros2 import LATCHED_QOS, MAX_DOMAIN, NO_HASH, SENSOR_QOS, RosNode, RosQos, RosTopic
 from gnd.fleet_bus.serving import Request
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, Scan
@@ -189,6 +190,7 @@ def play_plain(
 
 
 @click.command(name="play")
+@identity_option
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--ros2", "on", flag_value="ros2", help="On topics of ROS 2 over rmw_zenoh.")
 @click.option("--zenoh", "on", flag_value="zenoh", help="On plain keys: a drive of ours with all that it holds.")

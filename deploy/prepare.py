@@ -35,6 +35,7 @@ class PreparedRun:
         starts_s: when each starts, in a time that is common to all; empty: each drives in a time of its own.
         world: the simulated world itself, None for recorded drives.
         made_up: boxes that were put into the recorded drives, None where none were.
+        identities: folder of the processes' identities, None in a plain fleet.
     """
 
     agent_drives: tuple[Path, ...]
@@ -42,6 +43,7 @@ class PreparedRun:
     starts_s: tuple[float, ...] = ()
     world: Path | None = None
     made_up: MadeUp | None = None
+    identities: Path | None = None
 
 
 def prepare(config: FleetConfig, folder: RunFolder, source: Source, progress: Progress) -> PreparedRun:

@@ -22,6 +22,8 @@ from typing import Any, Final
 
 from gnd.deploy.errors import ProcessDied
 from gnd.deploy.lab.namespaces import enter_namespace
+from gnd.fleet_bus.config import PLAIN_VARIABLE
+from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE
 
 PRELOAD: Final = ("gnd.deploy.preload",)
 STOP_GRACE_S: Final = 10.0
@@ -46,6 +48,7 @@ class ProcessSpec:
         args: picklable arguments of the role.
         restart: start it again when it ends with an exit code other than 0.
         namespace: the network namespace that it enters first of all; None stays in the launcher's.
+        identity: its identity folder; None: it has none.
     """
 
     name: str
@@ -53,6 +56,7 @@ class ProcessSpec:
     args: tuple[Any, ...]
     restart: bool = True
     namespace: str | None = None
+    identity: Path | None = None
 
 
 @dataclass(slots=True)
@@ -210,6 +214,9 @@ def _run_role(spec: ProcessSpec, log_path: str) -> None:
     try:
         if spec.namespace is not None:
             enter_namespace(spec.namespace)  # before any thread of Zenoh's: threads are born where their maker is
+            os.environ[PLAIN_VARIABLE] = "1"  # a lab's namespaces reach nobody else
+        if spec.identity is not None:
+            os.environ[IDENTITY_VARIABLE] = str(spec.identity)  # for the processes that it starts, too
         spec.role(*spec.args, stop=stop)
     except Exception:
         logging.getLogger(spec.role.__module__).exception("%s failed", spec.role.__name__)

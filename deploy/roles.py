@@ -9,6 +9,7 @@ from gnd.deploy.processes import ProcessSpec
 from gnd.deploy.watch import record_updates
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.router import run_router, wait_for_stop
 from gnd.gnd_map.region import Region
 from gnd.tile_store.server import TileServer
@@ -47,6 +48,7 @@ def store(path: Path, connect: str, *, stop: threading.Event) -> None:
         open_bus(BusConfig(connect=(connect,), patient=True), name="store") as bus,
         TileServer(opened, bus),
     ):
+        follow_revoked(bus)
         wait_for_stop(stop)
 
 

@@ -8,10 +8,12 @@ import click
 from gnd.deploy.watch import TileWatch
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.gnd_map.region import parse_region
 
 
 @click.command()
+@identity_option
 @click.argument("region")
 @click.option("--connect", default="tcp/127.0.0.1:7447", show_default=True, help="Router to connect to.")
 @click.option("--layer", "layers", multiple=True, default=("ndt",), show_default=True, help="Map layer; repeatable.")

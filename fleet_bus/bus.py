@@ -1,7 +1,7 @@
 """The bus as the rest of the project sees it: the only door to zenoh."""
 
 import threading
-from typing import Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from gnd.fleet_bus import leftovers, requesting, subscribing
 from gnd.fleet_bus.config import BusConfig
@@ -9,6 +9,7 @@ from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.ledger import Ledger, SharesOf
 from gnd.fleet_bus.part import Part
 from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.sealing import CERTIFICATE_ROOT
 from gnd.fleet_bus.seals import PUBLISHERS
 from gnd.fleet_bus.serving import Handler, Serving, TurnOf
 from gnd.fleet_bus.subscribing import (
@@ -22,6 +23,9 @@ from gnd.fleet_bus.subscribing import (
 )
 from gnd.fleet_bus.wire import WireBytes
 from gnd.gnd_map.tile_id import TileId
+
+if TYPE_CHECKING:
+    from gnd.fleet_bus.identity.renewal import CertificateWatch
 
 _DEFAULT_RETRY = RetryPolicy()
 CERTIFICATE_S: Final = 5.0
@@ -51,7 +55,7 @@ def open_bus(config: BusConfig | None = None, ledger: Ledger | None = None, name
     if sealing is not None:
         sealing.fetch = lambda key: bus.request(key, b"", kind="control", timeout_s=CERTIFICATE_S)
         if sealing.own.role in PUBLISHERS:  # vehicles send theirs along
-            bus.serve(sealing.certificate_key, lambda _request: sealing.chain, kind="control")
+            bus.serve(f"{CERTIFICATE_ROOT}/*", sealing.answer_certificate, kind="control")
     return bus
 
 
@@ -268,6 +272,11 @@ class Bus:
     def wait_connected(self, timeout_s: float) -> bool:
         """Waits for a router; False when there is none in time. Raises `BusClosed` when closed meanwhile."""
         return self._connection.wait_connected(timeout_s)
+
+    @property
+    def certificate(self) -> "CertificateWatch | None":
+        """The certificate that this session shows, None without TLS."""
+        return self._connection.certificate
 
     @property
     def is_closed(self) -> bool:

@@ -1,17 +1,23 @@
 """Settings of a bus session, checked, and their translation for zenoh."""
 
+import ipaddress
 import json
 import math
-from dataclasses import dataclass
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import zenoh
 
 from gnd.fleet_bus.errors import BusConfigError
+from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.links import LinkProfile, load_link
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+PLAIN_VARIABLE: Final = "GND_PLAIN_BEYOND_LOOPBACK"
+"""Environment variable: "1" allows endpoints without TLS beyond this machine, where anybody may read and write."""
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
 """Limit of every message, in both directions."""
 QUEUE_LIMIT: Final = 4096
@@ -66,7 +72,9 @@ class BusConfig:
         open_timeout_s: how long `open_bus` tries to reach a router, s.
         patient: whether `open_bus` returns without a router, too, and looks for one as long as it takes: what is
             declared until then is declared when it is found, requests wait for it.
-        identity: folder with the part's certificate; then what it says is sealed, and what it hears must be.
+        identity: identity folder (`gnd certs`), which "tls/" endpoints need; by default that of GND_IDENTITY. A client
+            with one seals what it says, and demands seals of what it hears.
+        rights: access control of a router (`rights.access_control`); empty: none.
     """
 
     mode: Literal["client", "router"] = "client"
@@ -76,7 +84,8 @@ class BusConfig:
     lease_ms: int = 0
     open_timeout_s: float = 10.0
     patient: bool = False
-    identity: Path | None = None
+    identity: Path | None = field(default_factory=identity_of_environment)
+    rights: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.mode not in ("client", "router"):
@@ -89,6 +98,9 @@ class BusConfig:
             raise BusConfigError("only a client waits for a router")
         for endpoint in (*self.connect, *self.listen):
             check_endpoint(endpoint)
+            check_privacy(endpoint, self.identity)
+        if self.rights and self.mode != "router":
+            raise BusConfigError("only a router gives rights")
         if self.lease_ms != 0 and self.lease_ms < 100:
             raise BusConfigError(f"lease_ms must be 100 or more (or 0: the link's own), got {self.lease_ms}")
 
@@ -105,9 +117,41 @@ def check_endpoint(endpoint: str) -> None:
         BusConfigError: with an example of what is meant.
     """
     protocol, slash, address = endpoint.partition("/")
+    if protocol == "unixsock-stream" and address:
+        return
     host, _, port = address.partition("#")[0].rpartition(":")
     if not (slash and protocol and host and port.isdecimal() and len(port) <= 5 and int(port) < 65_536):
         raise BusConfigError(f"endpoint {endpoint!r} is not like {DEFAULT_ENDPOINT}")
+
+
+def check_privacy(endpoint: str, identity: Path | None) -> None:
+    """Refuses "tls/" without an identity, and anything else beyond this machine.
+
+    Raises:
+        BusConfigError: with what to do about it.
+    """
+    protocol, _, rest = endpoint.partition("/")
+    if protocol == "tls":
+        if identity is None:
+            raise BusConfigError(
+                f"{endpoint} needs an identity folder: --identity FOLDER or GND_IDENTITY (`gnd certs`)"
+            )
+        return
+    if protocol == "unixsock-stream" or os.environ.get(PLAIN_VARIABLE) == "1":
+        return
+    host = rest.partition("#")[0].rpartition(":")[0].strip("[]")
+    if not _is_loopback(host):
+        raise BusConfigError(
+            f"{endpoint} is plain and reaches beyond this machine: whoever gets there could read and forge everything;"
+            f" use tls/{rest} with an identity (`gnd certs`), or set {PLAIN_VARIABLE}=1 in a network that you trust"
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def zenoh_config(config: BusConfig) -> zenoh.Config:
@@ -151,7 +195,28 @@ def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
     settings = _session_settings(config, link) | (_router_rules() if config.mode == "router" else {})
     if link.send_buffer_bytes:
         settings["transport/link/tcp/so_sndbuf"] = link.send_buffer_bytes
+        settings["transport/link/tls/so_sndbuf"] = link.send_buffer_bytes
+    if config.identity is not None:
+        settings |= _tls(config.identity)
+    if config.rights:
+        settings["access_control"] = dict(config.rights)
     return settings | _patience(config)
+
+
+def _tls(identity: Path) -> dict[str, Any]:
+    """TLS of both sides; zenoh reads the files anew for each connection that it opens."""
+    certificate, key = str(identity / "certificate.pem"), str(identity / "key.pem")
+    tls = {
+        "root_ca_certificate": str(identity / "authority.pem"),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+    }
+    return {f"transport/link/tls/{name}": value for name, value in tls.items()}
 
 
 def _patience(config: BusConfig) -> dict[str, Any]:

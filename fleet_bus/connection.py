@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import zenoh
 
@@ -19,12 +19,19 @@ from gnd.fleet_bus.sealing import Sealing
 from gnd.fleet_bus.wire import WireMeter
 from gnd.gnd_map.tile_id import TileId
 
+if TYPE_CHECKING:  # a process without an identity loads nothing of it
+    from gnd.fleet_bus.identity.renewal import CertificateWatch
+
 _LOG = logging.getLogger(__name__)
 _POLL_S: Final = 0.02
 _CLOSE_S: Final = 1.0
 _FIRST_WAIT_S: Final = 0.05
 _LONGEST_WAIT_S: Final = 1.0
 _SAY_S: Final = 60.0
+_TURNED_AWAY_S: Final = 2.0
+"""A connection that ends so soon after it began was turned away."""
+_TURNED_AWAY: Final = 3
+"""So many of them in a row are told of."""
 
 Declare = Callable[[zenoh.Session], None]
 
@@ -41,12 +48,15 @@ class Connection:
         self._declarations: list[Declare] = []
         self._opening = threading.RLock()
         self.closed = threading.Event()
-        self.sealing = None if config.identity is None else Sealing.of_folder(config.identity)
+        seals = config.identity is not None and config.mode == "client"  # a router only passes on
+        self.sealing = Sealing.of_folder(config.identity) if seals and config.identity is not None else None
         self.meter = WireMeter(config.lease_ms or config.link_profile.lease_ms)
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()
         self._calls = 0
         self._idle = threading.Condition()
+        self._began_s, self._turned_away, self._told_s = 0.0, 0, -math.inf
+        self.certificate: CertificateWatch | None = None
         if ledger is not None:
             ledger.begin(config.link_profile)
 
@@ -60,12 +70,14 @@ class Connection:
             BusConfigError: zenoh refuses the configuration.
         """
         connection = cls(config, ledger, name)
+        connection._watch_certificate()
         deadline_s = time.monotonic() + (0.0 if config.patient else config.open_timeout_s)
         wait_s = _FIRST_WAIT_S
         while not connection._try_open():
             if time.monotonic() + wait_s > deadline_s and not config.patient:
-                where = ", ".join(config.connect)
-                raise NoRouter(f"no router at {where} for {config.open_timeout_s:g} s: start one with `gnd router`")
+                where, why = ", ".join(config.connect), connection._why()
+                connection.close()
+                raise NoRouter(f"no router at {where} for {config.open_timeout_s:g} s: {why}")
             if config.patient:
                 threading.Thread(target=connection._keep_trying, name=f"open {name}", daemon=True).start()
                 break
@@ -83,8 +95,42 @@ class Connection:
                 return
             if time.monotonic() - said_s >= _SAY_S:
                 said_s = time.monotonic()
-                _LOG.warning("%s: no router at %s for %.1f s: waiting for it", self.name, where, said_s - began_s)
+                _LOG.warning(
+                    "%s: no router at %s for %.1f s, waiting for it: %s",
+                    self.name,
+                    where,
+                    said_s - began_s,
+                    self._why(),
+                )
             wait_s = min(_LONGEST_WAIT_S, wait_s * 1.5)
+
+    def _watch_certificate(self) -> None:
+        """For a client over TLS: take a renewed certificate as soon as it lies in the folder."""
+        if self.config.identity is None or self.config.mode == "router" or not _is_tls(self.config.connect):
+            return
+        from gnd.fleet_bus.identity.renewal import CertificateWatch
+
+        name = self.name or "session"
+        self.certificate = CertificateWatch(self.config.identity, lambda _new: self._connect_anew(), name)
+
+    def _connect_anew(self) -> None:
+        """Ends the connection in a moment in which nothing is being sent: zenoh makes another, with the new files."""
+        if self.sealing is not None and self.config.identity is not None:
+            self.sealing.renew(self.config.identity)
+        with self._idle:
+            self._idle.wait_for(lambda: self._calls == 0, _CLOSE_S)
+            self.meter.cut()
+
+    def _why(self) -> str:
+        """What keeps a router from being reached, as far as it can be found out."""
+        if self.config.identity is not None and _is_tls(self.config.connect):
+            from gnd.fleet_bus.identity.cause import why_not
+
+            causes = {one: why_not(one, self.config.identity) for one in self.config.connect if _is_tls((one,))}
+            found = [f"{cause} ({one})" for one, cause in causes.items() if cause]
+            if found:
+                return "; ".join(found)
+        return "start one with `gnd router`"
 
     def _try_open(self) -> bool:
         """One attempt; False when no router answers."""
@@ -223,6 +269,8 @@ class Connection:
     def close(self) -> None:
         """Ends the session and every waiting call; the wire meter keeps its total."""
         self.closed.set()
+        if self.certificate is not None:
+            self.certificate.close()
         if not self._wait_idle():
             # Calls wait for a stalled link and would hold the session open: cut the link off.
             self.meter.cut()
@@ -243,10 +291,25 @@ class Connection:
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         link = event.link
         if event.kind == zenoh.SampleKind.PUT:
+            self._began_s = time.monotonic()
             self.meter.attach(link.src, link.dst)
         else:
             self.meter.detach(link.src, link.dst)
+            self._note_end(link.dst)
         _LOG.debug("%s: link %s -> %s %s", self.name, link.src, link.dst, event.kind)
+
+    def _note_end(self, router: str) -> None:
+        """Tells of a router that ends every connection at once: TLS succeeds there, so nothing else would say why."""
+        now_s = time.monotonic()
+        self._turned_away = self._turned_away + 1 if now_s - self._began_s < _TURNED_AWAY_S else 0
+        if self.certificate is None or self._turned_away < _TURNED_AWAY or now_s - self._told_s < _SAY_S:
+            return
+        self._told_s, own = now_s, self.certificate.identity.member.common_name
+        _LOG.warning("%s: %s ends each connection of %s at once: is it revoked there?", self.name, router, own)
+
+
+def _is_tls(endpoints: tuple[str, ...]) -> bool:
+    return any(endpoint.startswith("tls/") for endpoint in endpoints)
 
 
 def _raise_if_final(error: zenoh.ZError, config: BusConfig) -> None:

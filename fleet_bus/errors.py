@@ -3,6 +3,7 @@
 BusError
 ├── BusConfigError      a setting that would lose data, or makes no sense
 ├── LinkError           a link profile that is unknown or malformed
+├── IdentityError       an identity folder or an authority that cannot be used
 ├── NoRouter            nothing answers at the endpoints
 ├── PortInUse           the router's endpoint is taken
 ├── BusClosed           the bus was closed while a call was waiting
@@ -28,6 +29,10 @@ class BusConfigError(BusError):
 
 class LinkError(BusError):
     """A link profile is unknown or malformed."""
+
+
+class IdentityError(BusError):
+    """A certificate, key or list of an authority is missing, damaged, or does not belong here."""
 
 
 class NoRouter(BusError):

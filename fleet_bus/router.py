@@ -9,12 +9,17 @@ import os
 import resource
 import threading
 from collections.abc import Sequence
-from typing import Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.guard import USUAL_LIMITS, Address, ConnectionGuard, GuardLimits, address
+from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.part import Part
+
+if TYPE_CHECKING:  # a router without an identity loads nothing of it
+    from gnd.fleet_bus.gate import SecureRouter
 
 _LOG = logging.getLogger(__name__)
 _LOOK_UP_S: Final = 0.25
@@ -36,8 +41,7 @@ def open_router(
         PortInUse: another process listens there.
         BusConfigError: malformed endpoint.
     """
-    _raise_file_limit()
-    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVING_THREADS}))")  # read at first use
+    _prepare()
     config = BusConfig(mode="router", listen=tuple(listen), connect=tuple(connect))
     bus = open_bus(config, name="router")
     bus.keep(_Guarding(bus, limits or USUAL_LIMITS))
@@ -69,11 +73,23 @@ def _address(locator: str) -> Address:
         return host, int(port)
 
 
+def start_router(
+    listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = (), identity: Path | None = None
+) -> "Bus | SecureRouter":
+    """A running router: with an identity one that gives rights; errors as `open_router` and `gate.SecureRouter`."""
+    if identity is None:
+        return open_router(listen, connect)
+    from gnd.fleet_bus.gate import SecureRouter
+
+    _prepare()
+    return SecureRouter(listen, connect, identity)
+
+
 def run_router(
     listen: Sequence[str] = (DEFAULT_ENDPOINT,), *, stop: threading.Event, connect: Sequence[str] = ()
 ) -> None:
-    """Runs a router until the event is set; errors as `open_router`."""
-    with open_router(listen, connect):
+    """Runs a router until the event is set, with the identity of the environment; errors as `start_router`."""
+    with start_router(listen, connect, identity_of_environment()):
         _LOG.info("router listens at %s", ", ".join(listen))
         wait_for_stop(stop)
     _LOG.info("router ended")
@@ -86,6 +102,11 @@ def wait_for_stop(stop: threading.Event) -> None:
     """
     while not stop.wait(_LOOK_UP_S):
         pass
+
+
+def _prepare() -> None:
+    _raise_file_limit()
+    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVING_THREADS}))")  # read at first use
 
 
 def _raise_file_limit() -> None:

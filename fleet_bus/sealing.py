@@ -10,9 +10,9 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
-from gnd.fleet_bus.errors import BusError, SealError
+from gnd.fleet_bus.errors import BusError, NotMine, SealError
 from gnd.fleet_bus.seal_keys import KnownCertificates, load_authority, load_signer
 from gnd.fleet_bus.seals import (
     ANSWERED_BY,
@@ -26,6 +26,9 @@ from gnd.fleet_bus.seals import (
     check_signature,
     question_digest,
 )
+
+if TYPE_CHECKING:
+    from gnd.fleet_bus.serving import Request
 
 _LOG = logging.getLogger(__name__)
 MOST_SKEW_S: Final = 600.0
@@ -65,7 +68,8 @@ class Sealing:
     def __init__(self, signer: Signer, certificates: KnownCertificates, own: Holder) -> None:
         self.own, self.refused = own, Counter[str]()
         self.fetch: Fetch | None = None
-        self._signer, self._certificates = signer, certificates
+        self._signers: tuple[Signer, ...] = (signer,)
+        self._certificates = certificates
         self._lock = threading.Lock()
         self._nonces: OrderedDict[bytes, float] = OrderedDict()
         self._in_vain: dict[bytes, float] = {}
@@ -82,15 +86,26 @@ class Sealing:
         signer, certificates = load_signer(folder), load_authority(folder)
         return cls(signer, certificates, certificates.learn(signer.chain))
 
-    @property
-    def chain(self) -> bytes:
-        """The own certificates, as others ask for them."""
-        return self._signer.chain
+    def renew(self, folder: Path) -> None:
+        """Sign with the certificate that lies in the folder now; errors as `of_folder`."""
+        signer = load_signer(folder)
+        self.own = self._certificates.learn(signer.chain)
+        self._signers = (signer, *self._signers[:1])
 
     @property
-    def certificate_key(self) -> str:
-        """Where they are asked for."""
-        return f"{CERTIFICATE_ROOT}/{self._signer.certificate_id.hex()}"
+    def _signer(self) -> Signer:
+        return self._signers[0]
+
+    def answer_certificate(self, request: "Request") -> bytes:
+        """The own certificates, to who asks for them by id; those of the certificate before the last renewal, too.
+
+        Raises:
+            NotMine: another part's.
+        """
+        for signer in self._signers:
+            if _chunk(request.key, 3) == signer.certificate_id.hex():
+                return signer.chain
+        raise NotMine
 
     def question(self, key: str, payload: bytes, *, count_wanted: bool, with_chain: bool) -> SealedQuestion:
         """Seal a question."""

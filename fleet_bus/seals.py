@@ -46,11 +46,11 @@ ANSWERED_BY: Final = {
     "state": "shard",
 }
 ASKED_BY: Final = {"change": "vehicle", "state": "vehicle"}
-NOTICED_BY: Final = {"update": "shard", "want": "shard", "traffic": "vehicle"}
+NOTICED_BY: Final = {"update": "shard", "want": "shard"}
 PUBLISHERS: Final = frozenset({"tiles", "shard"})
 """Roles whose certificates everybody asks for."""
-OWN_NAME: Final = frozenset({"state", "traffic"})
-"""Keys whose fourth chunk is the name of who asks or puts."""
+OWN_NAME: Final = frozenset({"state"})
+"""Keys whose fourth chunk is the name of who asks."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,14 +5,13 @@ so a duplicate of the descriptor is kept until the link is reported as gone, and
 """
 
 import contextlib
-import os
 import socket
-import stat
 import struct
 import threading
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
+
+from gnd.fleet_bus.sockets import duplicate_of
 
 _TCP_INFO_BYTES: Final = 232
 KEEP_ALIVE_BYTES: Final = 3
@@ -21,7 +20,6 @@ _TIMESTAMPS: Final = 1  # TCPI_OPT_TIMESTAMPS of linux/tcp.h
 # Offsets in struct tcp_info of linux/tcp.h.
 _OPTIONS_AT, _SEGMENT_SIZE_AT, _BYTES_RECEIVED_AT, _SEGMENTS_AT, _DATA_SEGMENTS_AT = 5, 16, 128, 136, 152
 _BYTES_SENT_AT = 200  # with the bytes sent again beside it
-_FD_FOLDER: Final = Path("/proc/self/fd")
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +145,7 @@ class WireMeter:
 
     def attach(self, source: str, destination: str) -> None:
         """Begins to count the connection between two locators ("tcp/host:port"), and bounds its time to transmit."""
-        tap = _duplicate_of(source, destination)
+        tap = duplicate_of(source, destination)
         if tap is None:
             return
         with contextlib.suppress(OSError):  # ended already, or not Linux
@@ -246,50 +244,3 @@ def _keep_alive_bytes(stream_bytes: int, packets: int, now: _Counters) -> int:
     if packets <= 0 or stream_bytes != packets * KEEP_ALIVE_BYTES:
         return 0
     return packets * (KEEP_ALIVE_BYTES + now.header_bytes)
-
-
-def _duplicate_of(source: str, destination: str) -> socket.socket | None:
-    """A second descriptor of this process's socket between two locators; None where there is none."""
-    wanted = _address(source), _address(destination)
-    for descriptor in _descriptors():
-        tap = _tcp_socket(descriptor)
-        if tap is None:
-            continue
-        if _ends_of(tap) == wanted:
-            return tap
-        tap.close()
-    return None
-
-
-def _descriptors() -> list[int]:
-    try:
-        return [int(entry.name) for entry in _FD_FOLDER.iterdir()]
-    except OSError:  # not Linux, or no descriptor left
-        return []
-
-
-def _tcp_socket(descriptor: int) -> socket.socket | None:
-    try:
-        if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
-            return None
-        tap = socket.socket(fileno=os.dup(descriptor))
-    except OSError:  # closed meanwhile by the thread that owns it
-        return None
-    if tap.family in (socket.AF_INET, socket.AF_INET6) and tap.type == socket.SOCK_STREAM:
-        return tap
-    tap.close()
-    return None
-
-
-def _ends_of(tap: socket.socket) -> tuple[tuple[str, int], tuple[str, int]] | None:
-    try:
-        own, peer = tap.getsockname(), tap.getpeername()
-    except OSError:  # not connected
-        return None
-    return (own[0], own[1]), (peer[0], peer[1])
-
-
-def _address(locator: str) -> tuple[str, int]:
-    """("::1", 7447) of "tcp/[::1]:7447#options"."""
-    host, _, port = locator.partition("/")[2].partition("#")[0].rpartition(":")
-    return host.strip("[]"), int(port)

@@ -97,6 +97,13 @@ KEY_TABLE: Final = (
         reply="–",
         reliability="ends with its process at once, or after the lease if its machine fails",
     ),
+    KeySpec(
+        pattern=f"{ROOT}/authority/<list>",
+        kind="put, operator → routers, shards, tile servers",
+        request="`members`: MemberList (JSON, signed); `revoked`: CRL (PEM)",
+        reply="–",
+        reliability="the list with the highest number counts; also in the identity folder of each router",
+    ),
 )
 
 _PREFIX = re.compile(r"(?:[01][0-3]{4}(?:/[0-3]{5}){0,3})?")
@@ -191,6 +198,11 @@ def alive_key(role: str, member: str) -> str:
 def alive_keys(role: str) -> str:
     """The liveliness tokens of every process in a role."""
     return f"{ROOT}/alive/{_matching('role', role, WORD_PATTERN)}/*"
+
+
+def authority_key(name: str) -> str:
+    """Where a list of the authority is put: "members" or "revoked"."""
+    return f"{ROOT}/authority/{_matching('list', name, WORD_PATTERN)}"
 
 
 def parse_tile_key(key: str) -> tuple[str, TileId]:

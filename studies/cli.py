@@ -55,6 +55,10 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "studies.codec_study.study:codec",
         "What tiles weigh and what rounding does to poses, real and simulated.",
     ),
+    "identity": (
+        "studies.security_study.identity:identity",
+        "What certificates cost a vehicle and a router, and how fast one is taken back.",
+    ),
     "real": ("studies.real.study:real", "Detection on recordings of real sensors, with objects inserted."),
 }
 

@@ -14,9 +14,12 @@ import click
 from prometheus_client import CollectorRegistry
 
 from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.certificate_metrics import certificate_checks, register_certificate
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.health import HealthServer
 from gnd.fleet_bus.health_options import metrics_options
+from gnd.fleet_bus.identity.following import follow_revoked
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.router import wait_for_stop
 from gnd.fleet_bus.settings_file import load_settings
 from gnd.fleet_bus.settings_options import settings_options
@@ -61,6 +64,7 @@ class TileServerConfig:
 @click.option("--workers", type=int, help="Threads that answer, 1 to 64.  [default: 4]")
 @settings_options
 @metrics_options
+@identity_option
 def store(
     path: Path | None,
     connect: tuple[str, ...],
@@ -91,10 +95,13 @@ def store(
         TileServer(opened, bus, workers=server.workers),
         ExitStack() as stack,
     ):
+        follow_revoked(bus)
         if metrics_port is not None:
             registry = CollectorRegistry()
             registry.register(StoreCollector(opened))
-            stack.enter_context(HealthServer(metrics_port, registry, store_checks(opened, bus), host=metrics_host))
+            register_certificate(registry, bus.certificate)
+            checks = {**store_checks(opened, bus), **certificate_checks(bus.certificate)}
+            stack.enter_context(HealthServer(metrics_port, registry, checks, host=metrics_host))
         counts = opened.counts()
         click.echo(f"tile server: {counts.tiles} tiles of {server.path} at {', '.join(server.connect)}; Ctrl-C ends it")
         wait_for_stop(stop)

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import settings_text
 
@@ -37,6 +38,7 @@ from gnd.gnd_map.settings import settings_text
 )
 @settings_options
 @click.option("--verbose", "-v", is_flag=True, help="Log every report and retry.")
+@identity_option
 def agent(
     drive: Path | None,
     live: str | None,

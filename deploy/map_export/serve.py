@@ -19,6 +19,7 @@ from gnd.deploy.map_export.served_map import ServedMap
 from gnd.deploy.map_export.tile_feeds import TileFeed, open_feed
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.ros2 import MAX_DOMAIN, RosNode
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile import Tile
@@ -105,6 +106,7 @@ def _end(service: MapService) -> ServeEvent:
 
 
 @click.command(short_help="Serve a map to Autoware over ROS 2, and follow its updates.")
+@identity_option
 @click.argument("source")
 @click.argument("folder", type=PATH)
 @click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Router of ROS 2.")

@@ -15,6 +15,7 @@ from typing import Any, Final
 from gnd.deploy import roles
 from gnd.deploy.fleet import cloud_processes
 from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.fleet_identities import make_identities
 from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
 from gnd.deploy.run_folder import RunFolder, create_run_folder
 from gnd.deploy.site import loopback_site
@@ -58,6 +59,7 @@ class SteadyOptions:
     sensor: str = option("vlp16", "Of the vehicle.", known=SHORT_NAMES)
     link: str = option("4g", "Profile of its link.")
     pace: float = option(1.0, "Times real time; a slower pace has more keep-alives a km.")
+    secure: bool = option(False, "With certificates, TLS and rights on the bus.")
     deadline_s: float = option(1800.0, "The drive is given up after so many seconds.", "--deadline")
 
     def __post_init__(self) -> None:
@@ -185,7 +187,7 @@ def _fill_store_and_cache(folder: RunFolder, files: WorldFiles) -> None:
 
 def _drive(options: SteadyOptions, folder: RunFolder, drive: Path) -> None:
     config = FleetConfig(agents=1, shards=1, link=options.link)
-    site = loopback_site(config, 1)
+    site = loopback_site(config, 1, make_identities(folder.root, 1, 1) if options.secure else None)
     agent = AgentConfig(
         vehicle=_VEHICLE,
         drive=drive,
@@ -198,8 +200,9 @@ def _drive(options: SteadyOptions, folder: RunFolder, drive: Path) -> None:
     with _supervised(folder) as supervisor:
         for spec in cloud_processes(config, folder, site):
             supervisor.start(spec)
+        vehicle = ProcessSpec(_VEHICLE, roles.agent, (agent,), restart=False, identity=site.identity_of(_VEHICLE))
         time.sleep(_SETTLE_S)
-        supervisor.start(ProcessSpec(_VEHICLE, roles.agent, (agent,), restart=False))
+        supervisor.start(vehicle)
         deadline_s = time.monotonic() + options.deadline_s
         while not supervisor.finished(_VEHICLE):
             if time.monotonic() > deadline_s:

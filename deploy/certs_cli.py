@@ -1,0 +1,180 @@
+"""`gnd certs`: the authority of a fleet, and the identities that it issues."""
+
+import datetime as dt
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gnd.deploy.errors import DeployError
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.errors import IdentityError
+from gnd.fleet_bus.identity.names import ROLES, MemberName, identity_of_environment
+from gnd.schemas.keys import authority_key
+
+PATH = click.Path(path_type=Path)
+_AUTHORITY = click.option(
+    "--authority", type=PATH, default=Path("authority"), show_default=True, help="Folder of the authority."
+)
+_DAYS = click.option("--days", type=click.FloatRange(min=0), default=0.0, help="How long it holds.  [default: 7 or 30]")
+_TO = click.option("--to", "folders", type=PATH, multiple=True, help="Identity folder of a router; repeatable.")
+_CONNECT = click.option("--connect", help="A router that hears of it at once, with --identity of an operator.")
+_IDENTITY = click.option("--identity", type=PATH, help="Identity folder of the operator who tells the router.")
+
+
+@click.group()
+def certs() -> None:
+    """Issue, renew and revoke the certificates of vehicles, shards, tile servers, operators and routers."""
+
+
+@certs.command(short_help="Make an authority.")
+@_AUTHORITY
+@click.option("--name", default="GND fleet", show_default=True, help="Its common name.")
+def init(authority: Path, name: str) -> None:
+    """Make an authority: a root that holds ten years, and an empty register. Its folder belongs on no server."""
+    from gnd.fleet_bus.identity.authority import Authority
+
+    Authority.create(authority, name)
+    click.echo(f"authority {name!r} in {authority}: keep {authority / 'key.pem'} where no server reads it")
+
+
+def _issuing(role: str) -> click.Command:
+    @click.argument("name")
+    @_AUTHORITY
+    @click.option("--out", type=PATH, help=f"Identity folder.  [default: {role}.NAME]")
+    @click.option("--owner", default="", help="Organisation that it belongs to.")
+    @_DAYS
+    @_TO
+    @_CONNECT
+    @_IDENTITY
+    def issue(name: str, authority: Path, out: Path | None, owner: str, days: float, **options: Any) -> None:
+        from gnd.fleet_bus.identity.authority import Authority
+
+        opened, member = Authority(authority), MemberName(role, name)
+        folder = out or Path(member.common_name)
+        hosts = options.pop("hosts", ())
+        entry = opened.issue(member, folder, owner=owner, hosts=hosts, days=days)
+        click.echo(f"{member.common_name} in {folder}, until {entry.ends}")
+        _publish(opened, **options)
+
+    issue.__doc__ = f"Issue the identity of the {_SPOKEN[role]} NAME, and say so to routers."
+    if role == "router":
+        host = click.option("--host", "hosts", multiple=True, help="Name or address under which it is reached.")
+        issue = host(issue)
+    return click.command(name=role, short_help=f"Issue the identity of a {_SPOKEN[role]}.")(issue)
+
+
+_SPOKEN = {
+    "vehicle": "vehicle",
+    "shard": "merger shard",
+    "tiles": "tile server",
+    "operator": "operator",
+    "router": "router",
+}
+for _role in ROLES:
+    certs.add_command(_issuing(_role))
+
+
+@certs.command(short_help="Shut a member out.")
+@click.argument("member")
+@_AUTHORITY
+@_TO
+@_CONNECT
+@_IDENTITY
+def revoke(member: str, authority: Path, **options: Any) -> None:
+    """Take back every certificate of MEMBER, such as vehicle.v-17, and tell routers: they cut it off within seconds."""
+    from gnd.fleet_bus.identity.authority import Authority
+
+    opened = Authority(authority)
+    for entry in opened.revoke(MemberName.parse(member)):
+        click.echo(f"{member}: certificate {entry.serial} is revoked; it would have held until {entry.ends}")
+    _publish(opened, **options)
+
+
+@certs.command(short_help="Tell routers who belongs and who is revoked.")
+@_AUTHORITY
+@_TO
+@_CONNECT
+@_IDENTITY
+def publish(authority: Path, **options: Any) -> None:
+    """Put the lists of members and of the revoked into identity folders (--to), or on the bus (--connect)."""
+    from gnd.fleet_bus.identity.authority import Authority
+
+    if not options["folders"] and options["connect"] is None:
+        raise DeployError("nobody to tell: name --to FOLDER or --connect ENDPOINT")
+    _publish(Authority(authority), **options)
+
+
+@certs.command(short_help="Renew certificates.")
+@click.argument("folders", nargs=-1, required=True, type=PATH)
+@_AUTHORITY
+@_DAYS
+@click.option("--all", "every", is_flag=True, help="Those too that hold for long yet.")
+def renew(folders: tuple[Path, ...], authority: Path, days: float, every: bool) -> None:
+    """Renew the identities in FOLDERS that end soon (in less than a quarter of their time), with new keys.
+
+    A running process takes the new certificate from its folder by itself.
+    """
+    from gnd.fleet_bus.identity.authority import Authority
+    from gnd.fleet_bus.identity.folder import load_identity
+
+    opened = Authority(authority)
+    for folder in folders:
+        identity = load_identity(folder)
+        if every or identity.ends_soon():
+            entry = opened.renew(folder, days)
+            click.echo(f"{identity.member.common_name} in {folder}: renewed until {entry.ends}")
+        else:
+            click.echo(f"{identity.member.common_name} in {folder}: holds until {identity.ends.isoformat()}")
+
+
+@certs.command(name="list", short_help="What was issued.")
+@_AUTHORITY
+@click.option("--json", "as_json", is_flag=True, help="As JSON.")
+def list_(authority: Path, as_json: bool) -> None:
+    """The register: what was issued to whom, until when, and what was revoked."""
+    from dataclasses import asdict
+
+    from gnd.fleet_bus.identity.authority import Authority
+
+    entries = Authority(authority).entries()
+    if as_json:
+        click.echo(json.dumps([asdict(entry) for entry in entries], indent=2))
+        return
+    now = dt.datetime.now(dt.UTC)
+    for entry in entries:
+        state = f"revoked {entry.revoked}" if entry.revoked else "holds" if entry.holds(now) else "ended"
+        click.echo(f"{entry.member.common_name:32} {entry.owner:16} {entry.begins} {entry.ends} {state}")
+
+
+@certs.command(short_help="What is wrong with an identity folder.")
+@click.argument("folder", type=PATH)
+@click.option("--connect", help="Also try this router, tls/host:port.")
+def check(folder: Path, connect: str | None) -> None:
+    """Check the identity in FOLDER, from whatever PKI it comes: files, key, chain, name, time, list of the revoked."""
+    from gnd.fleet_bus.identity.cause import why_not
+    from gnd.fleet_bus.identity.folder import load_identity, problems
+
+    identity = load_identity(folder)
+    found = problems(identity)
+    if connect is not None and not found:
+        cause = why_not(connect, folder)
+        found = [f"{connect}: {cause}"] if cause else []
+    if found:
+        raise IdentityError("; ".join(found))
+    click.echo(
+        f"{identity.member.common_name} ({identity.owner or 'no owner'}): holds until {identity.ends.isoformat()}"
+    )
+
+
+def _publish(authority: Any, folders: tuple[Path, ...], connect: str | None, identity: Path | None) -> None:
+    authority.copy_lists(folders)
+    if connect is None:
+        return
+    config = BusConfig(connect=(connect,), identity=identity or identity_of_environment())
+    with open_bus(config, name="certs") as bus:
+        for name, data in zip(("members", "revoked"), authority.lists(), strict=True):
+            bus.publish(authority_key(name), data, kind="control")
+    click.echo(f"told {connect}")

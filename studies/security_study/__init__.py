@@ -1,0 +1,1 @@
+"""What security costs, and how fast it acts."""
