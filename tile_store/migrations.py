@@ -26,6 +26,7 @@ STEPS: Final = (
     (7, "schema_of_uploads"),
     (8, "schema_of_parameters"),
     (9, "schema_of_new_roads"),
+    (10, "schema_of_trials"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 
