@@ -123,7 +123,8 @@ class Worker:
         """Of a tile of the voxel map."""
         tile, config = work.claim.tile, self._config
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
-        named = self._store.shifted_vehicles()
+        # behind a version that was withdrawn: alone they change nothing here until they are cleared
+        named = self._store.shifted_vehicles() | self._store.doubted_vehicles(work.claim.layer, tile)
         merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named, self._snapping)
         lattice = lattice_of_tile(work.epoch, epoch, config.codec)
         by_window = reports_by_window(work.reports, config.merge, self._unreadable)
@@ -177,6 +178,7 @@ class Worker:
             report_ids=tuple(row.report_id for row in work.reports),
             basis=Basis(work.journal.window, work.journal.seq, named, self._parameters),
             closed=tuple(closed),
+            trial=self._config.release.terms,
         )
 
     def _feature_bases(self, work: TileWork) -> dict[bytes, tuple[Feature, ...]]:

@@ -1,4 +1,4 @@
-"""Settling trials: released to all, withdrawn, paused; each is one transaction, and is written down with who and why."""
+"""Settling trials: released to all, withdrawn, paused; each in one transaction, written down with who and why."""
 
 import json
 from collections.abc import Mapping
@@ -10,6 +10,7 @@ from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile import diff
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
 from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store import sqlite_versions as versions
@@ -102,7 +103,10 @@ def behind(store: SqliteStore, trial: Trial) -> tuple[str, ...]:
         for version in (trial.version, trial.base_version)
     )
     by_voxel = of_new.of_voxels()
-    changed = changed_voxels(store, trial)
+    try:
+        changed = changed_voxels(store, trial)
+    except SchemaError:  # a damaged body is no reason to leave it with anybody
+        changed = frozenset()
     found = {report_id for voxel in changed for report_id in by_voxel.get(voxel, ())}
     # a voxel that fell back to what it was names no report of its own: those that are new have done it
     return tuple(sorted(found or set(of_new.report_ids) - set(of_old.report_ids) or of_new.report_ids))
@@ -134,5 +138,3 @@ def _provenance(c: apsw.Connection, trial: Trial, version: int) -> Any:
 
 def _text(trial: Trial, verdict: Verdict | None) -> str:
     return trial.verdict if verdict is None else json.dumps(verdict, sort_keys=True)
-
-

@@ -21,9 +21,7 @@ from gnd.tile_store.trials import (
 )
 
 
-def begin(
-    c: apsw.Connection, layer: str, tile: TileId, versions: tuple[int, int], terms: TrialTerms, now: int
-) -> None:
+def begin(c: apsw.Connection, layer: str, tile: TileId, versions: tuple[int, int], terms: TrialTerms, now: int) -> None:
     """Put a version on trial, and take back its notice: who is among the first finds it with the next question.
 
     `versions`: the released one and the new one.

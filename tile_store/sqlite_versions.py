@@ -116,6 +116,12 @@ def stored(c: apsw.Connection, statement: str, layer: str, tile: TileId, **value
     return StoredTile(rows[0][0], TileId(rows[0][1]), *rows[0][2:]) if rows else None
 
 
+def sha_of(c: apsw.Connection, layer: str, tile: TileId, version: int) -> bytes:
+    """The hash of a version; empty: there is none."""
+    rows = fetch(c, "sha_of_version", {"layer": layer, "tile": tile.morton, "version": version})
+    return rows[0][0] if rows else b""
+
+
 def epoch_of(c: apsw.Connection, layer: str, tile: TileId) -> int:
     """The latest version of a tile that is a base or a rollback; 0 when there is none."""
     return _head(c, layer, tile).epoch

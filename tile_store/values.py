@@ -541,7 +541,8 @@ class Publication:
     each changed feature, when known. `waiting` is what the reports claim and the content has not;
     None: as before. `shift_tests` and `courses` are those of this tile's reports, which add to the accounts
     of their vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have
-    come to, where any was folded. `trial`: a share of the fleet gets the version first; None: it is everybody's at once.
+    come to, where any was folded. `trial`: who gets the version first; None: it is
+    everybody's at once.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
