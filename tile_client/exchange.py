@@ -116,7 +116,7 @@ class Exchange(Generic[TileT]):
         ticket: int = 0,
         newest: bool = False,
     ) -> None:
-        self._ticket, self._newest = ticket, newest
+        self._ticket, self._wants_newest = ticket, newest
         self._bus, self._holder, self._timeout_s = bus, holder, timeout_s
         self._retry = RetryPolicy(attempt_timeout_s=attempt_s)
         self._kind = cast("type[TileT]", kind_of_layer(holder.layer))
@@ -175,7 +175,7 @@ class Exchange(Generic[TileT]):
             near=near,
             with_hashes=with_hashes,
             ticket=self._ticket,
-            newest=self._newest,
+            newest=self._wants_newest,
         )
         payload = self._bus.request(
             batch_key(layer, district),

@@ -15,7 +15,7 @@ from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store import sqlite_versions as versions
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.provenance import decode_provenance
+from gnd.tile_store.provenance import Provenance, decode_provenance
 from gnd.tile_store.sqlite_connection import change, fetch
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.trials import Trial
@@ -98,10 +98,7 @@ def behind(store: SqliteStore, trial: Trial) -> tuple[str, ...]:
     """The reports that the voxels come from in which a version on trial differs from the one before; where the store
     does not know them by voxel, all that the version has and the one before has not.
     """
-    of_new, of_old = (
-        store.look(lambda c, version=version: _provenance(c, trial, version))
-        for version in (trial.version, trial.base_version)
-    )
+    of_new, of_old = (_provenance(store, trial, version) for version in (trial.version, trial.base_version))
     by_voxel = of_new.of_voxels()
     try:
         changed = changed_voxels(store, trial)
@@ -128,9 +125,9 @@ def _differing(old: AnyTile, new: AnyTile) -> frozenset[int]:
     return frozenset(delta.removed.tolist()) | frozenset(delta.put.voxel_id.tolist())
 
 
-def _provenance(c: apsw.Connection, trial: Trial, version: int) -> Any:
+def _provenance(store: SqliteStore, trial: Trial, version: int) -> Provenance:
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": version}
-    rows = fetch(c, "provenance", place)
+    rows = store.look(lambda c: fetch(c, "provenance", place))
     if not rows:
         raise StoreError(f"tile {trial.tile.path} of layer {trial.layer} has no version {version}")
     return decode_provenance(rows[0][0])

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import apsw
@@ -93,7 +94,7 @@ def put_health(c: apsw.Connection, trial: Trial, told: VehicleHealth, now: int) 
 def health(c: apsw.Connection, trial: Trial) -> list[VehicleHealth]:
     """What vehicles have told of an open trial, by vehicle."""
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
-    return [VehicleHealth(*row[:-1], has_left=bool(row[-1])) for row in fetch(c, "trial_health", place)]
+    return [VehicleHealth(*row) for row in fetch(c, "trial_health", place)]
 
 
 def doubt(c: apsw.Connection, trial: Trial, report_ids: Iterable[str], now: int) -> None:
@@ -130,4 +131,4 @@ def steered(c: apsw.Connection, layer: str, tile: TileId) -> list[Steering]:
 
 def _trial(row: Row, salt: bytes = b"") -> Trial:
     layer, tile, *rest = row
-    return Trial(layer, TileId(tile), *rest, salt=salt)
+    return replace(Trial(layer, TileId(tile), *rest), salt=salt)

@@ -68,7 +68,7 @@ def clear_and_reenter(
 def _reentered(store: SqliteStore, layer: str, tile: TileId, now_ns: int) -> Iterator[ReportRow]:
     """The doubted reports that retention has left, each whole: of one in two parts the second."""
     for one in _doubted(store, layer, tile):
-        parts = store.look(lambda c, name=one.report_id: inbox.of_report(c, layer, tile, name))
+        parts = _parts(store, layer, tile, one.report_id)
         if not parts:
             continue
         try:
@@ -85,6 +85,10 @@ def _reentered(store: SqliteStore, layer: str, tile: TileId, now_ns: int) -> Ite
             body=replace(report, report_id=named).encode(),
             base_sha=parts[-1].base_sha,
         )
+
+
+def _parts(store: SqliteStore, layer: str, tile: TileId, report_id: str) -> list[ReportRow]:
+    return store.look(lambda c: inbox.of_report(c, layer, tile, report_id))
 
 
 def _doubted(store: SqliteStore, layer: str, tile: TileId) -> list[DoubtedReport]:

@@ -59,10 +59,8 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
         where = ", ".join(config.connect)
         _log.warning("%s: no router at %s for %g s: off on the cache", config.vehicle, where, config.open_timeout_s)
     bus.declare_alive(alive_key("agent", config.vehicle))
-    fetcher, sender = (
-        TileFetcher(bus, cache, config.download, ticket_of(config.vehicle)),
-        SenderThread(bus, outbox, config.vehicle),
-    )
+    fetcher = TileFetcher(bus, cache, config.download, ticket_of(config.vehicle))
+    sender = SenderThread(bus, outbox, config.vehicle)
     try:
         yield Link(bus, ledger, cache, outbox, fetcher, sender)
     finally:

@@ -5,7 +5,7 @@ sends; a message holds the totals of a visit, so the next one makes up for a los
 """
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
@@ -24,6 +24,8 @@ from gnd.vehicle_agent.place import Place
 
 LOOK_M: Final = 2.0
 """A scan is looked at after so much way."""
+LONG_S: Final = 60.0
+"""A visit that takes longer is told of before it ends."""
 TROUBLE_S: Final = 10.0
 """New trouble is told no oftener than this, by the time of the drive."""
 
@@ -63,11 +65,18 @@ class _Visit:
         return TileHealth(self.tile, self.version, self.scans, matched, fit, elsewhere, *counts, left=self.left)
 
     def has_news(self, t_ns: int) -> bool:
-        """Whether there is something to tell now: it was taken, it was left, or trouble has come."""
+        """Whether there is something to tell now: it was taken or left, trouble has come, or it goes on for long."""
         if self.told is None or self.left != self.told.left:
             return True
+        passed_s = (t_ns - self.told_ns) * 1e-9
         more = self.not_good > self.told.not_good or self.gated > self.told.gated
-        return more and (t_ns - self.told_ns) * 1e-9 >= TROUBLE_S
+        is_long = not self.told.is_told and self.scans > 0 and passed_s >= LONG_S
+        return is_long or (more and passed_s >= TROUBLE_S)
+
+    def tell(self, t_ns: int) -> TileHealth:
+        """The totals, from now on told."""
+        self.told, self.told_ns = self.totals(), t_ns
+        return self.told
 
 
 class TrialTelemetry:
@@ -128,35 +137,27 @@ class TrialTelemetry:
     def due(self, *, all_of_it: bool = False) -> list[HealthReport]:
         """The messages that are to go out now; `all_of_it`: the drive has ended."""
         with self._lock:
-            visits = [*self._over, *self._visits.values()]
+            over, self._over = self._over, []
             if all_of_it:
-                for visit in visits:
+                for visit in self._visits.values():
                     visit.left = True
-            news = [visit for visit in visits if visit.has_news(self._t_ns)]
-            if not news:
-                return []
-            self._told_ns = max(self._told_ns + 1, self._t_ns)
-            for visit in news:
-                visit.told, visit.told_ns = visit.totals(), self._told_ns
-            self._over = []
-            return list(self._reports([visit.told for visit in news if visit.told is not None]))
+            return [*self._tell(over), *self._tell(self._visits.values())]
 
-    def _reports(self, told: Iterable[TileHealth]) -> Iterable[HealthReport]:
-        newest = {one.tile: one for one in told}  # of a tile that was left and taken again the visit that goes on
-        for district, group in groupby(
-            sorted(newest.values(), key=lambda one: one.tile), lambda one: one.tile.district
-        ):
-            tiles = tuple(group)[:MAX_TILES_OF_HEALTH]
-            yield HealthReport(self._layer, district, self._told_ns, tiles)
+    def _tell(self, visits: Iterable[_Visit]) -> Iterator[HealthReport]:
+        """The messages about those of some visits of which there is news, a tile once."""
+        news = {visit.tile: visit for visit in visits if visit.has_news(self._t_ns)}
+        self._told_ns = max(self._told_ns + 1, self._t_ns)
+        for district, group in groupby(sorted(news), lambda tile: tile.district):
+            told = tuple(news[tile].tell(self._told_ns) for tile in list(group)[:MAX_TILES_OF_HEALTH])
+            yield HealthReport(self._layer, district, self._told_ns, told)
 
     def _follow(self, t_ns: int) -> bool:
         """Begin and end visits as tiles come and go; whether any is under way."""
         watched = self._watched()
         if not watched and not self._visits:
             return False
-        held = {
-            tile: found.version for tile in watched if (found := self._map.tile(tile)) is not None and found.version
-        }
+        tiles = {tile: self._map.tile(tile) for tile in watched}
+        held = {tile: found.version for tile, found in tiles.items() if found is not None and found.version}
         with self._lock:
             self._t_ns = max(self._t_ns, t_ns)
             for tile, visit in list(self._visits.items()):
