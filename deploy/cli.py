@@ -27,6 +27,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "Every byte of a run, compared with 3G, 4G and 5G; also as a page.",
     ),
     "map": ("gnd.deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
+    "release": ("gnd.deploy.release_cli:release", "See and steer new versions on trial with a share of the fleet."),
     "view": ("gnd.deploy.map_export.view:view", "Show a map, its changes and its fleet in Rerun."),
     "features": ("gnd.deploy.features_cli:features", "Import, export and list feature layers: Lanelet2, GeoJSON, ..."),
     "lanes": ("gnd.deploy.lanes_cli:lanes", "Lane borders of a Lanelet2 map kept by vehicles, and edits of the map."),
