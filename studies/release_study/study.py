@@ -34,6 +34,8 @@ from studies.frame.tables import Sheet, sheet_of
 from studies.release_study.shifted import shifted
 from studies.release_study.visits import MapWith, tiles_driven_through, visits
 
+MOST_VEHICLES: Final = 400
+"""Of a fleet that is drawn."""
 _HOUR_NS: Final = 3_600_000_000_000
 _START_NS: Final = 1_800_000_000_000_000_000
 
@@ -43,8 +45,8 @@ class ReleaseOptions:
     """Drives of one street, and fleets that are drawn of them."""
 
     seed: int = option(907, "Seed of the street and its drives.", "--seed")
-    drives: int = option(36, "Vehicles that drive on the map as it is.", span=(8, 200))
-    first: int = option(14, "Those of them that also drive on each shifted tile.", span=(4, 200))
+    drives: int = option(24, "Vehicles that drive on the map as it is.", span=(8, 200))
+    first: int = option(8, "Those of them that also drive on each shifted tile.", span=(4, 200))
     scans: int = option(140, "Scans of a drive.", span=(50, 2000))
     shifts_m: tuple[float, ...] = option((0.3, 0.5, 1.0), "Shifts of the tile, metres.", "--shifts", repeated=True)
     share: float = option(0.1, "Share of the fleet that gets a version first.", span=(0.01, 0.5))
@@ -140,7 +142,7 @@ def _fleets(options: ReleaseOptions, told: Mapping[str, Sequence[TileHealth]], k
     rng, trial = np.random.default_rng(options.seed), _trial(options.share)
     ends, vehicles, first = Counter[str](), list[int](), list[int]()
     for _ in range(options.releases):
-        decision, n_new, n = _one_fleet(rng, trial, told[kind], told["0"], is_null=kind == "0")
+        decision, n_new, n = _one_fleet(rng, trial, {"new": told[kind], "old": told["0"]})
         ends[decision] += 1
         if decision != "wait":
             vehicles.append(n)
@@ -158,28 +160,25 @@ def _fleets(options: ReleaseOptions, told: Mapping[str, Sequence[TileHealth]], k
 
 
 def _one_fleet(
-    rng: np.random.Generator, trial: Trial, new: Sequence[TileHealth], old: Sequence[TileHealth], *, is_null: bool
+    rng: np.random.Generator, trial: Trial, told: Mapping[Arm, Sequence[TileHealth]]
 ) -> tuple[str, int, int]:
-    """The decision on one release, and of how many vehicles (those of the new version, all).
-
-    Where the version does no harm, each vehicle is drawn once, whichever version it has: the arms are then nothing but
-    a random split. Else the arms draw from what was told on their versions, with repetition.
+    """The decision on one release, and of how many vehicles (those of the new version, all). Vehicles are drawn from
+    those that drove, with repetition.
     """
-    order = rng.permutation(len(old)) if is_null else rng.integers(0, 1 << 30, 400)
     said, looks, n_new = list[VehicleHealth](), LooksTaken(), 0
-    for k, drawn in enumerate(order.tolist()):
-        is_new = bool(rng.random() < trial.share)
-        n_new += is_new
-        told = (new if is_new and not is_null else old)[drawn % len(new if is_new and not is_null else old)]
-        if sum(one.arm == ("new" if is_new else "old") for one in said) < ARM_MOST:
-            said.append(_row(told, "new" if is_new else "old"))
-        if not is_new and k % 4:
+    for k in range(MOST_VEHICLES):
+        arm: Arm = "new" if rng.random() < trial.share else "old"
+        n_new += arm == "new"
+        drawn = told[arm][int(rng.integers(len(told[arm])))]
+        if sum(one.arm == arm for one in said) < ARM_MOST:
+            said.append(_row(drawn, arm))
+        if arm == "old" and k % 4:
             continue
         found = judged(trial, said, _START_NS + _HOUR_NS, looks)
         looks = found.looks
         if found.decision != "wait":
             return found.decision, n_new, k + 1
-    return "wait", n_new, len(order)
+    return "wait", n_new, MOST_VEHICLES
 
 
 def _trial(share: float) -> Trial:
