@@ -20,10 +20,10 @@ from gnd.tile_store.arguments import parse_tile
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.options import PATH, existing, json_option, layer_option, show, to_read
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.trials import Trial
+from gnd.tile_store.trials import VersionTrial
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-Steer = Callable[[SqliteStore, Trial, str, str], bool]
+Steer = Callable[[SqliteStore, VersionTrial, str, str], bool]
 
 
 @click.group()
@@ -134,7 +134,7 @@ def _steer(path: Path, tile: str, layer: str, as_json: bool, why: str, work: Ste
     show(values, as_json, lambda console: console.print(f"{tile_id.path} version {now.version}: {now.state}"))
 
 
-def _open_trial(store: SqliteStore, layer: str, tile: TileId) -> Trial:
+def _open_trial(store: SqliteStore, layer: str, tile: TileId) -> VersionTrial:
     found = store.trials(layer, tile.path).get(tile)
     if found is None:
         raise StoreError(f"no version of tile {tile.path} of layer {layer} is on trial; `gnd release list` shows them")
@@ -150,7 +150,7 @@ def _who() -> str:
     return f"{name}@{socket.gethostname()}"
 
 
-def _told(trial: Trial) -> dict[str, Any]:
+def _told(trial: VersionTrial) -> dict[str, Any]:
     verdict = json.loads(trial.verdict) if trial.verdict else None
     return {
         "layer": trial.layer,

@@ -8,7 +8,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import CatalogEntry
 from gnd.schemas.tiles_batch import TilesRequest
 from gnd.tile_store.store import Store
-from gnd.tile_store.trials import Trial
+from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.values import StoredTile
 
 
@@ -29,7 +29,7 @@ def released(store: Store, layer: str, tile: TileId) -> StoredTile | None:
 def heads_for(
     request: TilesRequest,
     heads: Mapping[TileId, CatalogEntry],
-    trials: Mapping[TileId, Trial],
+    trials: Mapping[TileId, VersionTrial],
     held: Mapping[TileId, bytes | None],
 ) -> dict[TileId, CatalogEntry]:
     """The versions that a client gets.
@@ -53,5 +53,5 @@ def heads_for(
     return dict(heads) | before
 
 
-def _before(trial: Trial) -> CatalogEntry:
+def _before(trial: VersionTrial) -> CatalogEntry:
     return CatalogEntry(trial.tile, trial.base_version, trial.base_sha)

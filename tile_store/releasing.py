@@ -18,12 +18,12 @@ from gnd.tile_store.errors import StoreError
 from gnd.tile_store.provenance import Provenance, decode_provenance
 from gnd.tile_store.sqlite_connection import change, fetch
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.trials import Trial
+from gnd.tile_store.trials import VersionTrial
 
 Verdict = Mapping[str, Any]
 
 
-def release(store: SqliteStore, trial: Trial, who: str, why: str, verdict: Verdict | None = None) -> bool:
+def release(store: SqliteStore, trial: VersionTrial, who: str, why: str, verdict: Verdict | None = None) -> bool:
     """The version is everybody's from now on, and its notice goes out; False: the trial was settled already."""
 
     def work(c: apsw.Connection, now: int) -> bool:
@@ -37,7 +37,7 @@ def release(store: SqliteStore, trial: Trial, who: str, why: str, verdict: Verdi
     return store.transact(work)
 
 
-def withdraw(store: SqliteStore, trial: Trial, who: str, why: str, verdict: Verdict | None = None) -> bool:
+def withdraw(store: SqliteStore, trial: VersionTrial, who: str, why: str, verdict: Verdict | None = None) -> bool:
     """The content before the trial becomes the next version, and the reports behind the trial are doubted; False: the
     trial was settled already.
 
@@ -56,7 +56,7 @@ def withdraw(store: SqliteStore, trial: Trial, who: str, why: str, verdict: Verd
     return store.transact(work)
 
 
-def hold(store: SqliteStore, trial: Trial, who: str, why: str, *, paused: bool) -> bool:
+def hold(store: SqliteStore, trial: VersionTrial, who: str, why: str, *, paused: bool) -> bool:
     """Nothing is decided until somebody does, or (not paused) by what vehicles tell; False: it was settled already."""
 
     def work(c: apsw.Connection, now: int) -> bool:
@@ -68,7 +68,7 @@ def hold(store: SqliteStore, trial: Trial, who: str, why: str, *, paused: bool) 
     return store.transact(work)
 
 
-def note_verdict(store: SqliteStore, trial: Trial, verdict: Verdict) -> None:
+def note_verdict(store: SqliteStore, trial: VersionTrial, verdict: Verdict) -> None:
     """Keep how far a trial has come, for who looks."""
     text = _text(trial, verdict)
     if text != trial.verdict and trial.state != "paused":
@@ -94,7 +94,7 @@ def clear(store: SqliteStore, layer: str, tile: TileId, who: str, why: str) -> i
     return store.transact(work)
 
 
-def behind(store: SqliteStore, trial: Trial) -> tuple[str, ...]:
+def behind(store: SqliteStore, trial: VersionTrial) -> tuple[str, ...]:
     """The reports that the voxels come from in which a version on trial differs from the one before; where the store
     does not know them by voxel, all that the version has and the one before has not.
     """
@@ -109,7 +109,7 @@ def behind(store: SqliteStore, trial: Trial) -> tuple[str, ...]:
     return tuple(sorted(found or set(of_new.report_ids) - set(of_old.report_ids) or of_new.report_ids))
 
 
-def changed_voxels(store: SqliteStore, trial: Trial) -> frozenset[int]:
+def changed_voxels(store: SqliteStore, trial: VersionTrial) -> frozenset[int]:
     """The voxels in which a version on trial differs from the one before."""
     old = store.get(trial.layer, trial.tile, trial.base_version)
     new = store.get(trial.layer, trial.tile, trial.version)
@@ -125,7 +125,7 @@ def _differing(old: AnyTile, new: AnyTile) -> frozenset[int]:
     return frozenset(delta.removed.tolist()) | frozenset(delta.put.voxel_id.tolist())
 
 
-def _provenance(store: SqliteStore, trial: Trial, version: int) -> Provenance:
+def _provenance(store: SqliteStore, trial: VersionTrial, version: int) -> Provenance:
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": version}
     rows = store.look(lambda c: fetch(c, "provenance", place))
     if not rows:
@@ -133,5 +133,5 @@ def _provenance(store: SqliteStore, trial: Trial, version: int) -> Provenance:
     return decode_provenance(rows[0][0])
 
 
-def _text(trial: Trial, verdict: Verdict | None) -> str:
+def _text(trial: VersionTrial, verdict: Verdict | None) -> str:
     return trial.verdict if verdict is None else json.dumps(verdict, sort_keys=True)

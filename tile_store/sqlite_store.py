@@ -30,7 +30,7 @@ from gnd.tile_store.retention import trim_quarantine
 from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.rows_kept import RowsKept
 from gnd.tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
-from gnd.tile_store.trials import Trial
+from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from gnd.tile_store.values import (
     DEFAULT_LAYER,
@@ -480,7 +480,7 @@ class SqliteStore:
 
     # Trials
 
-    def trials(self, layer: str, prefix: str = "") -> dict[TileId, Trial]:
+    def trials(self, layer: str, prefix: str = "") -> dict[TileId, VersionTrial]:
         """See `Store.trials`."""
         with self._readers.snapshot() as c:
             return trials.open_trials(c, layer, prefix)

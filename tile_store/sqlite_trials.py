@@ -15,10 +15,10 @@ from gnd.tile_store.trials import (
     SETTLED_KEPT,
     DoubtedReport,
     Steering,
-    Trial,
     TrialState,
     TrialTerms,
     VehicleHealth,
+    VersionTrial,
 )
 
 
@@ -34,7 +34,7 @@ def begin(c: apsw.Connection, layer: str, tile: TileId, versions: tuple[int, int
     change(c, "delete_notice", place)
 
 
-def open_trials(c: apsw.Connection, layer: str, prefix: str = "") -> dict[TileId, Trial]:
+def open_trials(c: apsw.Connection, layer: str, prefix: str = "") -> dict[TileId, VersionTrial]:
     """The open trials of a region by tile."""
     first, end = morton_range(prefix)
     rows = fetch(c, "open_trials", {"layer": layer, "first": first, "end": end})
@@ -44,28 +44,28 @@ def open_trials(c: apsw.Connection, layer: str, prefix: str = "") -> dict[TileId
     return {(one := _trial(row, salt)).tile: one for row in rows}
 
 
-def open_trial(c: apsw.Connection, layer: str, tile: TileId) -> Trial | None:
+def open_trial(c: apsw.Connection, layer: str, tile: TileId) -> VersionTrial | None:
     """The open trial of a tile."""
     return open_trials(c, layer, tile.path).get(tile)
 
 
-def all_open(c: apsw.Connection) -> list[Trial]:
+def all_open(c: apsw.Connection) -> list[VersionTrial]:
     """Every open trial, by layer and tile."""
     layers = [layer for (layer,) in fetch(c, "layers_on_trial")]
     return [trial for layer in layers for trial in open_trials(c, layer).values()]
 
 
-def settled(c: apsw.Connection, n: int) -> list[Trial]:
+def settled(c: apsw.Connection, n: int) -> list[VersionTrial]:
     """The settled trials, newest first."""
     return [_trial(row) for row in fetch(c, "settled_trials", {"n": n})]
 
 
-def of_tile(c: apsw.Connection, layer: str, tile: TileId) -> list[Trial]:
+def of_tile(c: apsw.Connection, layer: str, tile: TileId) -> list[VersionTrial]:
     """All trials of a tile that are known, oldest first."""
     return [_trial(row) for row in fetch(c, "trials_of_tile", {"layer": layer, "tile": tile.morton})]
 
 
-def set_state(c: apsw.Connection, trial: Trial, state: TrialState, verdict: str, now: int) -> bool:
+def set_state(c: apsw.Connection, trial: VersionTrial, state: TrialState, verdict: str, now: int) -> bool:
     """Change an open trial; False, and nothing is changed: it is settled already. What vehicles told goes with it."""
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
     settled_ns = None if state in ("trial", "paused") else now
@@ -84,20 +84,20 @@ def supersede(c: apsw.Connection, layer: str, tile: TileId, now: int) -> None:
         set_state(c, trial, "superseded", trial.verdict, now)
 
 
-def put_health(c: apsw.Connection, trial: Trial, told: VehicleHealth, now: int) -> bool:
+def put_health(c: apsw.Connection, trial: VersionTrial, told: VehicleHealth, now: int) -> bool:
     """Keep what a vehicle tells; False: it is older than what is known, or enough vehicles have spoken."""
     row: dict[str, Any] = {name: getattr(told, name) for name in VehicleHealth.__slots__ if name != "first_ns"}
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
     return change(c, "put_trial_health", row | place | {"now": now, "most": ARM_MOST}) == 1
 
 
-def health(c: apsw.Connection, trial: Trial) -> list[VehicleHealth]:
+def health(c: apsw.Connection, trial: VersionTrial) -> list[VehicleHealth]:
     """What vehicles have told of an open trial, by vehicle."""
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
     return [VehicleHealth(*row) for row in fetch(c, "trial_health", place)]
 
 
-def doubt(c: apsw.Connection, trial: Trial, report_ids: Iterable[str], now: int) -> None:
+def doubt(c: apsw.Connection, trial: VersionTrial, report_ids: Iterable[str], now: int) -> None:
     """The reports behind a withdrawn version are doubted from now on."""
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
     change(c, "put_doubted_report", place | {"ids": json.dumps(list(report_ids)), "now": now})
@@ -118,7 +118,7 @@ def clear_doubts(c: apsw.Connection, layer: str, tile: TileId, who: str, now: in
     return change(c, "clear_doubted", {"layer": layer, "tile": tile.morton, "who": who, "now": now})
 
 
-def steer(c: apsw.Connection, trial: Trial, who: str, action: str, why: str, now: int) -> None:
+def steer(c: apsw.Connection, trial: VersionTrial, who: str, action: str, why: str, now: int) -> None:
     """Write down who does what."""
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
     change(c, "steer", place | {"who": who, "action": action, "why": why, "now": now})
@@ -129,6 +129,6 @@ def steered(c: apsw.Connection, layer: str, tile: TileId) -> list[Steering]:
     return [Steering(*row) for row in fetch(c, "steered", {"layer": layer, "tile": tile.morton})]
 
 
-def _trial(row: Row, salt: bytes = b"") -> Trial:
+def _trial(row: Row, salt: bytes = b"") -> VersionTrial:
     layer, tile, *rest = row
-    return replace(Trial(layer, TileId(tile), *rest), salt=salt)
+    return replace(VersionTrial(layer, TileId(tile), *rest), salt=salt)

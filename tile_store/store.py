@@ -8,7 +8,7 @@ from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_store.roads import RoadPart
-from gnd.tile_store.trials import Trial
+from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from gnd.tile_store.values import (
     DEFAULT_LAYER,
@@ -244,7 +244,7 @@ class Store(Protocol):
 
     # Trials
 
-    def trials(self, layer: str, prefix: str = "") -> Mapping[TileId, Trial]:
+    def trials(self, layer: str, prefix: str = "") -> Mapping[TileId, VersionTrial]:
         """The versions on trial of a region (a prefix of tile paths), by tile."""
 
     def doubted_vehicles(self, layer: str, tile: TileId) -> frozenset[str]:

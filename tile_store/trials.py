@@ -31,7 +31,7 @@ class TrialTerms:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class VersionTrial:
     """One version on trial, or what became of it.
 
     Attributes:

@@ -16,7 +16,7 @@ from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.sqlite_versions import sha_of
-from gnd.tile_store.trials import Arm, Trial, VehicleHealth
+from gnd.tile_store.trials import Arm, VehicleHealth, VersionTrial
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class HealthCollector:
         return counts
 
 
-def _arm(c: apsw.Connection, trial: Trial, ticket: int, told: TileHealth) -> Arm | None:
+def _arm(c: apsw.Connection, trial: VersionTrial, ticket: int, told: TileHealth) -> Arm | None:
     """Which version a vehicle speaks of; None: not the one that it was to have. The number may be an older one of the
     same content, which a vehicle keeps when a version is taken back.
     """

@@ -16,7 +16,7 @@ from gnd.tile_store import clocks, releasing
 from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.trials import DoubtedReport, Trial
+from gnd.tile_store.trials import DoubtedReport, VersionTrial
 from gnd.tile_store.values import ReportRow
 
 CONFIRMED_SHARE: Final = 0.5
@@ -25,7 +25,7 @@ ALIKE_STATES: Final = 0.5
 """Similarity of two states of a voxel that say the same."""
 
 
-def clear_confirmed(store: SqliteStore, released: Trial, who: str) -> int:
+def clear_confirmed(store: SqliteStore, released: VersionTrial, who: str) -> int:
     """Clear the doubts of a tile whose withdrawn version a released one confirms; how many reports that is.
 
     They are not merged again: the released version says what they said.
@@ -95,7 +95,7 @@ def _doubted(store: SqliteStore, layer: str, tile: TileId) -> list[DoubtedReport
     return [one for one in store.look(lambda c: trials.doubted_reports(c, layer, tile)) if one.cleared_ns is None]
 
 
-def _is_confirmed(store: SqliteStore, withdrawn: Trial, released: Trial) -> bool:
+def _is_confirmed(store: SqliteStore, withdrawn: VersionTrial, released: VersionTrial) -> bool:
     """Whether most of what a withdrawn version had changed is so in the released one."""
     changed = np.array(sorted(releasing.changed_voxels(store, withdrawn)), np.int32)
     then = store.get(withdrawn.layer, withdrawn.tile, withdrawn.version)

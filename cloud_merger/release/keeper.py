@@ -16,7 +16,7 @@ from gnd.tile_store import clocks, releasing
 from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store.errors import StoreClosed
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.trials import Trial
+from gnd.tile_store.trials import VersionTrial
 
 KEEP_EVERY_S: Final = 1.0
 NOTED_EVERY_S: Final = 10.0
@@ -52,7 +52,7 @@ class ReleaseKeeper:
         self._noted_s = {key: at_s for key, at_s in self._noted_s.items() if key in {_key(one) for one in own}}
         return False
 
-    def _judge(self, trial: Trial, now_ns: int) -> None:
+    def _judge(self, trial: VersionTrial, now_ns: int) -> None:
         before = looks_taken(trial)
         said = self._store.look(lambda c: trials.health(c, trial))
         found = judged(trial, said, now_ns, before)
@@ -67,7 +67,7 @@ class ReleaseKeeper:
         elif found.looks != before or self._is_due(trial):
             releasing.note_verdict(self._store, trial, found.as_dict())
 
-    def _is_due(self, trial: Trial) -> bool:
+    def _is_due(self, trial: VersionTrial) -> bool:
         now_s = time.monotonic()
         if now_s - self._noted_s.get(_key(trial), -math.inf) < NOTED_EVERY_S:
             return False
@@ -75,10 +75,10 @@ class ReleaseKeeper:
         return True
 
 
-def _key(trial: Trial) -> tuple[str, TileId, int]:
+def _key(trial: VersionTrial) -> tuple[str, TileId, int]:
     return trial.layer, trial.tile, trial.version
 
 
-def looks_taken(trial: Trial) -> LooksTaken:
+def looks_taken(trial: VersionTrial) -> LooksTaken:
     """The looks that were taken of a trial so far."""
     return LooksTaken(**json.loads(trial.verdict)["looks"]) if trial.verdict else LooksTaken()

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from statistics import median
 from typing import Any, Final, Literal
 
-from gnd.tile_store.trials import Trial, VehicleHealth
+from gnd.tile_store.trials import VehicleHealth, VersionTrial
 
 Decision = Literal["wait", "release", "withdraw"]
 
@@ -91,7 +91,7 @@ def _trouble(told: VehicleHealth) -> float:
     return max(told.gated, told.not_good) / told.inside if told.inside else 0.0
 
 
-def judged(trial: Trial, said: Sequence[VehicleHealth], now_ns: int, before: LooksTaken) -> Judgement:
+def judged(trial: VersionTrial, said: Sequence[VehicleHealth], now_ns: int, before: LooksTaken) -> Judgement:
     """Decide, from what each vehicle has told until now.
 
     Args:
@@ -127,7 +127,7 @@ def _due(new: int, old: int) -> int:
 
 
 def _decided(
-    trial: Trial,
+    trial: VersionTrial,
     arms: tuple[ArmFigures, ArmFigures],
     scores: dict[str, list[float]],
     looks: LooksTaken,

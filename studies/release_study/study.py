@@ -25,7 +25,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.health import HealthReport, TileHealth
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.trials import ARM_MOST, Arm, Trial, VehicleHealth
+from gnd.tile_store.trials import ARM_MOST, Arm, VehicleHealth, VersionTrial
 from gnd.tile_store.values import DEFAULT_LAYER
 from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import ReproduceError
@@ -160,7 +160,7 @@ def _fleets(options: ReleaseOptions, told: Mapping[str, Sequence[TileHealth]], k
 
 
 def _one_fleet(
-    rng: np.random.Generator, trial: Trial, told: Mapping[Arm, Sequence[TileHealth]]
+    rng: np.random.Generator, trial: VersionTrial, told: Mapping[Arm, Sequence[TileHealth]]
 ) -> tuple[str, int, int]:
     """The decision on one release, and of how many vehicles (those of the new version, all). Vehicles are drawn from
     those that drove, with repetition.
@@ -181,8 +181,8 @@ def _one_fleet(
     return "wait", n_new, MOST_VEHICLES
 
 
-def _trial(share: float) -> Trial:
-    return Trial(DEFAULT_LAYER, TileId(0), 2, 1, share, 24 * _HOUR_NS, _START_NS, "trial")
+def _trial(share: float) -> VersionTrial:
+    return VersionTrial(DEFAULT_LAYER, TileId(0), 2, 1, share, 24 * _HOUR_NS, _START_NS, "trial")
 
 
 def _row(told: TileHealth, arm: Arm = "old") -> VehicleHealth:

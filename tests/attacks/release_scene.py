@@ -23,7 +23,7 @@ from gnd.tile_client.exchange import Exchange, TilesInMemory
 from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store.released import released
 from gnd.tile_store.server import TileServer
-from gnd.tile_store.trials import Arm, Trial, TrialState
+from gnd.tile_store.trials import Arm, TrialState, VersionTrial
 
 SHARDS = ("left", "right")
 WARM_S = 120.0
@@ -73,21 +73,21 @@ class ReleaseCloud(Cloud):
         is_done = lambda: "waiting" not in self.store.upload_counts().by_state  # noqa: E731
         wait_for("the reports are looked at", is_done)
 
-    def trial(self, tile: TileId, cars: list[str], changed: dict[int, State | None], version: int = 1) -> Trial:
+    def trial(self, tile: TileId, cars: list[str], changed: dict[int, State | None], version: int = 1) -> VersionTrial:
         """The version that goes on trial when these vehicles have reported."""
         self.report(tile, cars, changed, version)
         wait_for("a version is on trial", lambda: tile in self.store.trials("ndt"))
         return self.store.trials("ndt")[tile]
 
-    def poisoned(self, tile: TileId) -> Trial:
+    def poisoned(self, tile: TileId) -> VersionTrial:
         """A wall that colluding vehicles have moved, on trial."""
         return self.trial(tile, [f"colluder-{tile.morton}-{k}" for k in range(3)], {1: SHIFTED_WALL})
 
-    def good(self, tile: TileId) -> Trial:
+    def good(self, tile: TileId) -> VersionTrial:
         """A pole that is there, on trial."""
         return self.trial(tile, [f"honest-{tile.morton}-{k}" for k in range(3)], {2: POLE})
 
-    def cars(self, trial: Trial, arm: Arm, count: int, prefix: str = "car") -> list[str]:
+    def cars(self, trial: VersionTrial, arm: Arm, count: int, prefix: str = "car") -> list[str]:
         """Vehicles that are to have one of the versions."""
         names = (f"{prefix}-{k}" for k in itertools.count())
         of_arm = (name for name in names if trial.is_among_first(ticket_of(name)) == (arm == "new"))
@@ -103,33 +103,33 @@ class ReleaseCloud(Cloud):
         """Any bytes on a vehicle's health key."""
         self.vehicles.publish(health_key(car), payload, kind="telemetry")
 
-    def fare(self, trial: Trial, arm: Arm, fits: list[int], prefix: str = "car") -> list[str]:
+    def fare(self, trial: VersionTrial, arm: Arm, fits: list[int], prefix: str = "car") -> list[str]:
         """Vehicles of an arm drive through and tell, one for each fit (1/1000)."""
         cars = self.cars(trial, arm, len(fits), prefix)
         for car, fit in zip(cars, fits, strict=True):
             self.tell(car, visit(trial, arm, fit_permille=fit))
         return cars
 
-    def others_fare_well(self, trial: Trial) -> None:
+    def others_fare_well(self, trial: VersionTrial) -> None:
         """Thirty vehicles on the version before, and the shard has heard them."""
         self.fare(trial, "old", [780 + k for k in range(30)])
         wait_for("the others are heard", lambda: self.heard(trial, "old") == 30 or not self.is_open(trial))
 
-    def heard(self, trial: Trial, arm: Arm) -> int:
+    def heard(self, trial: VersionTrial, arm: Arm) -> int:
         """Vehicles of an arm of which the store holds something."""
         return sum(one.arm == arm for one in self.store.look(lambda c: trials.health(c, trial)))
 
-    def is_open(self, trial: Trial) -> bool:
+    def is_open(self, trial: VersionTrial) -> bool:
         return trial.tile in self.store.trials("ndt")
 
-    def state(self, trial: Trial) -> TrialState:
+    def state(self, trial: VersionTrial) -> TrialState:
         known = self.store.look(lambda c: trials.of_tile(c, "ndt", trial.tile))
         return next(one.state for one in known if one.version == trial.version)
 
-    def settle(self, trial: Trial, state: TrialState) -> None:
+    def settle(self, trial: VersionTrial, state: TrialState) -> None:
         wait_for(f"{trial.tile} is {state}", lambda: self.state(trial) == state)
 
-    def stays_open(self, trial: Trial, for_s: float = 2.5) -> None:
+    def stays_open(self, trial: VersionTrial, for_s: float = 2.5) -> None:
         """For more than two looks of the shards."""
         end_s = time.monotonic() + for_s
         while time.monotonic() < end_s:
@@ -150,7 +150,7 @@ class ReleaseCloud(Cloud):
         return stored.version
 
 
-def visit(trial: Trial, arm: Arm, **said: int | bool) -> TileHealth:
+def visit(trial: VersionTrial, arm: Arm, **said: int | bool) -> TileHealth:
     """What a vehicle tells that drove through: all is well unless it says otherwise."""
     version = trial.version if arm == "new" else trial.base_version
     usual = {"scans": 20, "matched_permille": 900, "fit_permille": 790, "elsewhere_permille": 790, "inside": 15}

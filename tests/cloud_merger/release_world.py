@@ -10,7 +10,7 @@ from gnd.schemas.health import HealthReport, TileHealth
 from gnd.schemas.keys import change_key, health_key
 from gnd.schemas.ticket import ticket_of
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.trials import Arm, Trial
+from gnd.tile_store.trials import Arm, VersionTrial
 
 from merger_world import GROUND, TILE, VOXEL_BY_VOXEL, WALL, gaussians_of  # isort: skip
 from merger_world import POLE, State, change_of, report_of  # isort: skip
@@ -40,11 +40,11 @@ def reported(store: SqliteStore, number: int, vehicle: str = "", changed=None, b
     return report.report_id
 
 
-def on_trial(store: SqliteStore, tile: TileId = TILE) -> Trial:
+def on_trial(store: SqliteStore, tile: TileId = TILE) -> VersionTrial:
     return store.trials("ndt")[tile]
 
 
-def cars_of(trial: Trial, arm: Arm, count: int, prefix: str = "car") -> list[str]:
+def cars_of(trial: VersionTrial, arm: Arm, count: int, prefix: str = "car") -> list[str]:
     """Names of vehicles that are to have one of the versions."""
     names, number = list[str](), 0
     while len(names) < count:
@@ -55,7 +55,7 @@ def cars_of(trial: Trial, arm: Arm, count: int, prefix: str = "car") -> list[str
     return names
 
 
-def visit(trial: Trial, arm: Arm, **said) -> TileHealth:
+def visit(trial: VersionTrial, arm: Arm, **said) -> TileHealth:
     """What a vehicle tells that drove through: all is well unless it says otherwise."""
     version = trial.version if arm == "new" else trial.base_version
     usual = {"scans": 20, "matched_permille": 900, "fit_permille": 800, "elsewhere_permille": 800}
@@ -75,7 +75,7 @@ class Listener:
     def hear(self, car: str, told: TileHealth, t_ns: int = START_NS) -> None:
         self.collector.take(health_key(car), payload(told, t_ns))
 
-    def hear_all(self, trial: Trial, arm: Arm, fits: list[int], prefix: str = "car") -> list[str]:
+    def hear_all(self, trial: VersionTrial, arm: Arm, fits: list[int], prefix: str = "car") -> list[str]:
         """One vehicle for each fit (1/1000)."""
         cars = cars_of(trial, arm, len(fits), prefix)
         for car, fit in zip(cars, fits, strict=True):

@@ -14,11 +14,11 @@ from gnd.cloud_merger.release.verdict import (
     score_of,
 )
 from gnd.gnd_map.tile_id import TileId
-from gnd.tile_store.trials import Arm, Trial, VehicleHealth
+from gnd.tile_store.trials import Arm, VehicleHealth, VersionTrial
 
 HOUR_NS = 3_600_000_000_000
 START_NS = 1_800_000_000_000_000_000
-TRIAL = Trial("ndt", TileId(497353963154), 2, 1, 0.1, 24 * HOUR_NS, START_NS, "trial")
+TRIAL = VersionTrial("ndt", TileId(497353963154), 2, 1, 0.1, 24 * HOUR_NS, START_NS, "trial")
 NO_LOOKS = LooksTaken()
 SOON, OVER = START_NS + HOUR_NS, START_NS + 25 * HOUR_NS
 

@@ -15,7 +15,7 @@ from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.released import released, released_heads
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.trials import Trial, TrialTerms, VehicleHealth
+from gnd.tile_store.trials import TrialTerms, VehicleHealth, VersionTrial
 from gnd.tile_store.values import Claim, Publication
 
 OLD, NEW = tile_of_voxels(TILE, 1, 2), tile_of_voxels(TILE, 1, 2, 3)
@@ -42,11 +42,11 @@ def publish(store: SqliteStore, tile, number: int, terms: TrialTerms | None = TE
     return found.status
 
 
-def trial_of(store: SqliteStore) -> Trial:
+def trial_of(store: SqliteStore) -> VersionTrial:
     return store.trials("ndt")[TILE]
 
 
-def tickets(trial: Trial, *, first: bool) -> int:
+def tickets(trial: VersionTrial, *, first: bool) -> int:
     return next(ticket for ticket in range(1, TICKETS) if trial.is_among_first(ticket) == first)
 
 
@@ -100,7 +100,7 @@ def test_other_tiles_and_versions_have_other_first_vehicles_and_the_share_is_kep
     assert 1 <= ticket_of("car-1") <= TICKETS
 
 
-def _with(trial: Trial, **values) -> Trial:
+def _with(trial: VersionTrial, **values) -> VersionTrial:
     return replace(trial, **values)
 
 
