@@ -111,7 +111,7 @@ def run_worker(
         stack.enter_context(working(roads.work, threading.Event(), 1, ROADS_EVERY_S))  # surveys -> new roads
 
         # Release: what vehicles tell of versions on trial decides who gets them next.
-        HealthCollector(store, members).open(bus)
+        HealthCollector(store).open(bus)
         keeper = ReleaseKeeper(store, members)
         stack.enter_context(working(keeper.work, threading.Event(), 1, KEEP_EVERY_S))
 

@@ -91,6 +91,13 @@ def put_health(c: apsw.Connection, trial: VersionTrial, told: VehicleHealth, now
     return change(c, "put_trial_health", row | place | {"now": now, "most": ARM_MOST}) == 1
 
 
+def told_ns(c: apsw.Connection, trial: VersionTrial, vehicle: str) -> int:
+    """The time of what a vehicle told last of an open trial, by its clock; -1: nothing."""
+    place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version, "vehicle": vehicle}
+    rows = fetch(c, "trial_told", place)
+    return int(rows[0][0]) if rows else -1
+
+
 def health(c: apsw.Connection, trial: VersionTrial) -> list[VehicleHealth]:
     """What vehicles have told of an open trial, by vehicle."""
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}

@@ -1,7 +1,6 @@
 """A store with a version on trial, and vehicles that tell how they fare on it."""
 
 from gnd.cloud_merger.config import ShardConfig
-from gnd.cloud_merger.ownership import Members
 from gnd.cloud_merger.release.collector import HealthCollector
 from gnd.cloud_merger.release.parameters import ReleaseParameters
 from gnd.cloud_merger.work import Worker
@@ -70,7 +69,7 @@ class Listener:
     """A shard's collector without its bus."""
 
     def __init__(self, store: SqliteStore) -> None:
-        self.collector = HealthCollector(store, Members("one"))
+        self.collector = HealthCollector(store)
 
     def hear(self, car: str, told: TileHealth, t_ns: int = START_NS) -> None:
         self.collector.take(health_key(car), payload(told, t_ns))

@@ -22,6 +22,7 @@ from release_world import (
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.ownership import Members
+from gnd.cloud_merger.release.collector import HealthCollector
 from gnd.cloud_merger.release.doubts import clear_and_reenter
 from gnd.cloud_merger.release.keeper import ReleaseKeeper, looks_taken
 from gnd.cloud_merger.release.parameters import ReleaseParameters
@@ -294,3 +295,17 @@ def test_a_health_report_is_what_its_bytes_say():
         HealthReport("ndt", TILE.district, START_NS, (tile, tile))
     with pytest.raises(BadValue, match="another"):
         HealthReport("ndt", TileId(TILE.morton + 1024).district, START_NS, (tile,))
+
+
+def test_a_vehicle_that_floods_costs_no_writes_and_others_are_heard(store, trial):
+    now_s = [0.0]
+    collector = HealthCollector(store, lambda: now_s[0])
+    first, second = cars_of(trial, "new", 2)
+    for k in range(100):
+        collector.take(health_key(first), payload(visit(trial, "new"), START_NS + k))
+    collector.take(health_key(second), payload(visit(trial, "new")))
+    assert collector.counts["flooding"] > 85
+    assert {one.vehicle for one in store.look(lambda c: trials.health(c, trial))} == {first, second}
+    now_s[0] += 60.0
+    collector.take(health_key(first), payload(visit(trial, "new", fit_permille=1), START_NS + 1000))
+    assert {one.fit for one in store.look(lambda c: trials.health(c, trial))} == {800, 1}

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from parameter_inventory import inventory
 
-MOST = 122  # 117, the place of a simulated world (0137), and who gets new versions first: release.share, .longest_h (0157)
+MOST = 122  # 117, a simulated world (0137), and who gets new versions first: release.share, .longest_h (0157)
 """There were 547 before docs/decisions/0122-settings.md; more than now need a reason."""
 OF_A_SESSION = {"BusConfig"}
 

@@ -1028,6 +1028,10 @@ WHERE excluded.t_ns > trial_health.t_ns AND excluded.arm = trial_health.arm
 SELECT vehicle, arm, first_ns, t_ns, scans, matched, fit, elsewhere, inside, gated, not_good, has_left FROM trial_health
 WHERE layer = :layer AND tile = :tile AND version = :version ORDER BY vehicle
 
+-- name: trial_told
+SELECT t_ns FROM trial_health
+WHERE layer = :layer AND tile = :tile AND version = :version AND vehicle = :vehicle
+
 -- name: forget_trial_health
 DELETE FROM trial_health WHERE layer = :layer AND tile = :tile AND version = :version
 
