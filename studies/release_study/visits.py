@@ -15,6 +15,7 @@ from gnd.schemas.health import TileHealth
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.link.trial_telemetry import TrialTelemetry
 from gnd.vehicle_agent.local_map import LocalMap, Touched
+from gnd.vehicle_agent.localise.estimates import RefinedScan
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.pipeline import Parts, Pipeline
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
@@ -40,6 +41,10 @@ class _Telling:
         self._watched = watched
         self.trials: TrialTelemetry | None = None
 
+    def see(self, scan: RefinedScan) -> None:
+        assert self.trials is not None
+        self.trials.see(scan)
+
     def made(self, source: MapWith, local_map: LocalMap, touched: Touched) -> TilesAtHand:
         self.trials = TrialTelemetry(local_map, lambda: self._watched, "ndt", RegistrationParameters())
         return TilesAtHand(source, local_map, touched)
@@ -60,7 +65,7 @@ def visits(drive: Path, source: MapWith, watched: Iterable[TileId]) -> dict[Tile
         fix,
         lambda local_map, touched: telling.made(source, local_map, touched),
         PipelineParameters(),
-        parts=Parts(placed=(lambda scan: telling.trials and telling.trials.see(scan),)),
+        parts=Parts(placed=(telling.see,)),
     )
     trials, found = telling.trials, dict[TileId, TileHealth]()
     assert trials is not None
