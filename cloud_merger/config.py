@@ -11,6 +11,7 @@ from gnd.cloud_merger.confirmation import ConfirmationParameters
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.merge import MergeParameters
+from gnd.cloud_merger.release.parameters import ReleaseParameters
 from gnd.cloud_merger.wants import WantParameters
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.gnd_map.config import from_mapping
@@ -39,6 +40,7 @@ class ShardConfig:
         FeatureMergeParameters,
         "How statements become changes in feature layers.",
     )
+    release: ReleaseParameters = setting(ReleaseParameters, "How new versions reach the fleet.")
     ingest: IngestLimits = setting(IngestLimits, "Which reports are refused.")
     feature_layer: tuple[LayerParameters, ...] = setting(
         (),

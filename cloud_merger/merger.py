@@ -16,6 +16,8 @@ from gnd.cloud_merger.leases import Leases
 from gnd.cloud_merger.metrics import ShardMetrics
 from gnd.cloud_merger.ownership import KnownShards, Members, following
 from gnd.cloud_merger.reception import Reception
+from gnd.cloud_merger.release.collector import HealthCollector
+from gnd.cloud_merger.release.keeper import KEEP_EVERY_S, ReleaseKeeper
 from gnd.cloud_merger.states import States
 from gnd.cloud_merger.stored import Bases
 from gnd.cloud_merger.survey.mapper import RoadMapper
@@ -121,6 +123,11 @@ def run_worker(
         stack.enter_context(working(expander.work, arrived, _EXPANDERS, config.poll_s))
         roads = RoadMapper(store, config.shard_id, on_published=wake.set, codec=config.codec)
         stack.enter_context(working(roads.work, threading.Event(), 1, ROADS_EVERY_S))  # surveys -> new roads
+
+        # Release: what vehicles tell of versions on trial decides who gets them next.
+        HealthCollector(store).open(bus)
+        keeper = ReleaseKeeper(store, members)
+        stack.enter_context(working(keeper.work, threading.Event(), 1, KEEP_EVERY_S))
 
         worker, announcer = Worker(store, config, bases), Announcer(store, bus, members, bases)
         while not stop.is_set():

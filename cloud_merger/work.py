@@ -124,7 +124,9 @@ class Worker:
         tile, config = work.claim.tile, self._config
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
         out = (QUARANTINED + vehicle for vehicle in self._store.quarantined_vehicles())
-        named = self._store.shifted_vehicles().union(out)
+        # behind a version that was withdrawn: alone they change nothing here until they are cleared
+        doubted = self._store.doubted_vehicles(work.claim.layer, tile)
+        named = self._store.shifted_vehicles().union(out, doubted)
         merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named, self._snapping)
         lattice = lattice_of_tile(work.epoch, epoch, config.codec)
         by_window = reports_by_window(work.reports, config.merge, self._unreadable)
@@ -179,6 +181,7 @@ class Worker:
             report_ids=tuple(row.report_id for row in work.reports),
             basis=Basis(work.journal.window, work.journal.seq, named, self._parameters),
             closed=tuple(closed),
+            trial=self._config.release.terms,
         )
 
     def _feature_bases(self, work: TileWork) -> dict[bytes, tuple[Feature, ...]]:

@@ -28,6 +28,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "map": ("gnd.deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
     "vehicles": ("gnd.deploy.vehicles_cli:vehicles", "Whose reports count, why not, and who decides it."),
+    "release": ("gnd.deploy.release_cli:release", "See and steer new versions on trial with a share of the fleet."),
     "view": ("gnd.deploy.map_export.view:view", "Show a map, its changes and its fleet in Rerun."),
     "features": ("gnd.deploy.features_cli:features", "Import, export and list feature layers: Lanelet2, GeoJSON, ..."),
     "lanes": ("gnd.deploy.lanes_cli:lanes", "Lane borders of a Lanelet2 map kept by vehicles, and edits of the map."),

@@ -23,6 +23,7 @@ _CHANGES: Final = (f"{_V1}/change/**",)
 _STATES: Final = (f"{_V1}/state/*",)
 _WANTS: Final = (f"{_V1}/want/*",)
 _TRAFFIC: Final = (f"{_V1}/traffic/*",)
+_HEALTH: Final = (f"{_V1}/health/*",)
 _SHARDS_ALIVE: Final = (f"{_V1}/alive/merger/*",)
 _ALIVE: Final = (f"{_V1}/alive/**",)
 _CERTIFICATES: Final = (f"{_V1}/certificate/*",)
@@ -100,7 +101,7 @@ ROLE_RIGHTS: Final[dict[str, tuple[Right, ...]]] = {
         *_RECALLS,
         Right(("put",), _WANTS, ("egress",)),
         Right(("reply", "declare_queryable"), _STATES, ("egress",)),
-        Right(("declare_subscriber",), _TRAFFIC, ("egress",)),
+        Right(("declare_subscriber",), (*_TRAFFIC, *_HEALTH), ("egress",)),
     ),
     "shard": (
         *_answers(*_CHANGES, *_STATES, *_CERTIFICATES),
@@ -111,12 +112,12 @@ ROLE_RIGHTS: Final[dict[str, tuple[Right, ...]]] = {
         *_is_alive(*_RECALL),
         Right(("liveliness_query", "declare_liveliness_subscriber"), _RECALL, ("egress",)),
         *_sees_alive(*_SHARDS_ALIVE),
-        *_hears(AUTHORITY_KEYS),
+        *_hears(AUTHORITY_KEYS, *_HEALTH),
     ),
     "tiles": (*_answers(*_MAP, *_CERTIFICATES), *_hears(AUTHORITY_KEYS)),
     "operator": (
         *_asks(*_MAP, *_CERTIFICATES),
-        *_hears(*_UPDATES, *_TRAFFIC),
+        *_hears(*_UPDATES, *_TRAFFIC, *_HEALTH),
         *_RECALLS,
         *_sees_alive(*_ALIVE),
         *_puts(AUTHORITY_KEYS),
@@ -131,7 +132,7 @@ def _own_rights(member: MemberName) -> tuple[Right, ...]:
     name = member.name
     if member.role == "vehicle":
         return (
-            Right(("put",), (f"{_V1}/traffic/{name}",), ("ingress",)),
+            Right(("put",), (f"{_V1}/traffic/{name}", f"{_V1}/health/{name}"), ("ingress",)),
             Right(("declare_subscriber",), (f"{_V1}/want/{name}",), ("ingress",)),
             Right(("query",), (f"{_V1}/state/{name}",), ("ingress",)),
             *_is_alive(f"{_V1}/alive/agent/{name}"),

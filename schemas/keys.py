@@ -84,6 +84,13 @@ KEY_TABLE: Final = (
         reliability="totals: the next sample replaces a lost one",
     ),
     KeySpec(
+        pattern=f"{ROOT}/health/<vehicle>",
+        kind="put, agent → merger shards, while a version is on trial",
+        request="HealthReport",
+        reply="–",
+        reliability="totals of a visit: the next message replaces a lost one",
+    ),
+    KeySpec(
         pattern=f"{ROOT}/live/<vehicle>/<topic>",
         kind="put, a vehicle's own sensors → its agent; query on <topic> = header",
         request="the message of a drive's topic (`/lidar/points`: lidar-points); –",
@@ -184,6 +191,16 @@ def traffic_keys() -> str:
     return f"{ROOT}/traffic/*"
 
 
+def health_key(vehicle: str) -> str:
+    """Where a vehicle tells how it fares on tiles on trial."""
+    return f"{ROOT}/health/{_matching('vehicle', vehicle, VEHICLE_PATTERN)}"
+
+
+def health_keys() -> str:
+    """What every vehicle tells of tiles on trial."""
+    return f"{ROOT}/health/*"
+
+
 def live_key(vehicle: str, topic: str) -> str:
     """Where a vehicle's own sensors put the messages of a drive's topic, or "header", or "*"."""
     name = topic if topic == "*" else _matching("topic", topic.strip("/").replace("/", "-"), VEHICLE_PATTERN)
@@ -233,6 +250,12 @@ def parse_change_key(key: str) -> tuple[str, District]:
 def parse_traffic_key(key: str) -> str:
     """The vehicle of a traffic key; `BadKey`, `WrongVersion`."""
     (vehicle,) = _chunks(key, "traffic", 1)
+    return _matching("vehicle", vehicle, VEHICLE_PATTERN)
+
+
+def parse_health_key(key: str) -> str:
+    """The vehicle of a health key; `BadKey`, `WrongVersion`."""
+    (vehicle,) = _chunks(key, "health", 1)
     return _matching("vehicle", vehicle, VEHICLE_PATTERN)
 
 

@@ -95,3 +95,7 @@ MAX_FIXES_OF_SURVEY_PART: Final = 1_024
 MAX_TILES_OF_SUBMAP: Final = 64
 MAX_GAUSSIANS_OF_SUBMAP: Final = 40_000
 MAX_STEP_OF_SURVEY_M: Final = 100.0
+
+# How a vehicle fares on tiles on trial: those around it, with room.
+MAX_TILES_OF_HEALTH: Final = 256
+MAX_HEALTH_REPORT_BYTES: Final = 16 * KIB

@@ -13,6 +13,7 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import limits
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import tiles_reply_pb2, tiles_request_pb2
+from gnd.schemas.ticket import TICKETS
 from gnd.schemas.tile_answer import (
     ANSWER_HASH_BYTES,
     ANSWER_STATUS,
@@ -85,9 +86,15 @@ class TilesRequest:
     """Bodies beyond so many bytes wait for another request; the first always fits."""
     near: int | None = None
     """Index of the tile around which tiles are needed first; None = in order."""
+    ticket: int = 0
+    """Of a vehicle (`ticket_of`): who gets a version that is on trial; 0 = no vehicle, which gets what is released."""
+    newest: bool = False
+    """The newest versions are wanted, released or not."""
 
     def __post_init__(self) -> None:
         check_indices(self.wanted)
+        if not 0 <= self.ticket <= TICKETS:
+            raise BadValue(f"TilesRequest with ticket {self.ticket}: 0 .. {TICKETS}")
         check_codecs("TilesRequest", self.codecs)
         if not 1 <= self.max_bytes <= limits.MAX_TILE_BODY_BYTES:
             raise BadValue(f"TilesRequest for {self.max_bytes} bytes: 1 .. {limits.MAX_TILE_BODY_BYTES}")
@@ -109,6 +116,8 @@ class TilesRequest:
         max_bytes: int = limits.MAX_TILE_BODY_BYTES,
         near: TileId | None = None,
         with_hashes: bool = False,
+        ticket: int = 0,
+        newest: bool = False,
     ) -> Self:
         """A request for these tiles of one district, each once, in any order.
 
@@ -125,6 +134,8 @@ class TilesRequest:
             codecs=codecs,
             max_bytes=max_bytes,
             near=None if near is None else index_of(near),
+            ticket=ticket,
+            newest=newest,
         )
 
     def tiles(self, district: District) -> tuple[TileId, ...]:
@@ -141,6 +152,8 @@ class TilesRequest:
             codecs=() if self.codecs == EVERY_CODEC else self.codecs,
             max_bytes=0 if self.max_bytes == limits.MAX_TILE_BODY_BYTES else self.max_bytes,
             near=self.near,
+            ticket=self.ticket,
+            newest=self.newest,
         )
         return serialise(message, limits.MAX_TILES_REQUEST_BYTES)
 
@@ -158,6 +171,8 @@ class TilesRequest:
             codecs=tuple(message.codecs) or EVERY_CODEC,
             max_bytes=message.max_bytes or limits.MAX_TILE_BODY_BYTES,
             near=message.near if message.HasField("near") else None,
+            ticket=message.ticket,
+            newest=message.newest,
         )
 
 
@@ -209,9 +224,14 @@ class TilesReply:
     """The tile server's answers, one a tile, in the order of the request."""
 
     answers: tuple[TileAnswer, ...]
+    watched: tuple[int, ...] = ()
+    """Places, ascending, of the answers about tiles of which a version is on trial."""
 
     def __post_init__(self) -> None:
         check_length("TilesReply", len(self.answers), TILES, "tiles")
+        watched = self.watched
+        if watched and (watched[-1] >= len(self.answers) or any(a >= b for a, b in pairwise(watched))):
+            raise BadValue(f"TilesReply watches places {watched[:9]}… of {len(self.answers)}: ascending, once each")
 
     def of_request(self, request: TilesRequest, district: District) -> list[tuple[TileId, TileAnswer]]:
         """Each tile of the request with its answer.
@@ -237,6 +257,7 @@ class TilesReply:
             codecs=(answer.codec_id for answer in brought if answer.status == "blob"),
             bodies=(answer.body for answer in brought),
             days=_days([answer.day for answer in brought]),
+            watched=self.watched,
         )
         return serialise(message, limits.MAX_TILES_REPLY_BYTES)
 
@@ -250,7 +271,7 @@ class TilesReply:
             max_fields=limits.MAX_TILES_REPLY_FIELDS,
         )
         check_major(message, "TilesReply")
-        return cls(tuple(_answers(message)))
+        return cls(tuple(_answers(message)), tuple(message.watched))
 
 
 def _days(days: Sequence[int]) -> Sequence[int]:

@@ -50,6 +50,10 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "studies.real_localisation.study:real_localisation",
         "Odometry, localisation and georeferencing on real recordings.",
     ),
+    "release": (
+        "studies.release_study.study:release",
+        "Staged release: how soon a wrong tile is withdrawn, and how often a right one.",
+    ),
     "new-road": ("studies.new_road.study:new_road", "Roads that the map does not have, mapped by vehicles."),
     "codec": (
         "studies.codec_study.study:codec",

@@ -90,6 +90,8 @@ class ExchangeOutcome(Generic[TileT]):
     """The content was not what its hash says: ask for the whole tile."""
     body_bytes: dict[TileId, int] = field(default_factory=dict)
     """Size of each tile that came whole."""
+    watched: set[TileId] = field(default_factory=set)
+    """A version of these is on trial: the vehicle is asked how it fares there."""
 
 
 class Exchange(Generic[TileT]):
@@ -100,9 +102,21 @@ class Exchange(Generic[TileT]):
         holder: the tiles that are held; those that arrive are put there.
         timeout_s: how long a question is asked again before it fails.
         attempt_s: how long one attempt may take.
+        ticket: of a vehicle, see `TilesRequest`.
+        newest: ask for the newest versions, released or not.
     """
 
-    def __init__(self, bus: Bus, holder: TileHolder[TileT], timeout_s: float, attempt_s: float = 10.0) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        holder: TileHolder[TileT],
+        timeout_s: float,
+        attempt_s: float = 10.0,
+        *,
+        ticket: int = 0,
+        newest: bool = False,
+    ) -> None:
+        self._ticket, self._wants_newest = ticket, newest
         self._bus, self._holder, self._timeout_s = bus, holder, timeout_s
         self._retry = RetryPolicy(attempt_timeout_s=attempt_s)
         self._kind = cast("type[TileT]", kind_of_layer(holder.layer))
@@ -123,12 +137,12 @@ class Exchange(Generic[TileT]):
             SchemaError: the answer is none to this question.
         """
         held = self._held(t for t in tiles if t not in whole)
-        answers = self._answers(tiles, held, max_bytes, near)
+        outcome = ExchangeOutcome[TileT]()
+        answers = self._answers(tiles, held, max_bytes, near, outcome)
         unclear = [t for t in tiles if answers[t].status == "hash"]
         if unclear:
             near = None if near is None else unclear[0]
-            answers |= self._answers(unclear, held, max_bytes, near, with_hashes=True)
-        outcome = ExchangeOutcome[TileT]()
+            answers |= self._answers(unclear, held, max_bytes, near, outcome, with_hashes=True)
         for tile_id in tiles:
             self._take(tile_id, answers[tile_id], held.get(tile_id, NOTHING), outcome)
         return outcome
@@ -147,13 +161,22 @@ class Exchange(Generic[TileT]):
         held: Mapping[TileId, Head],
         max_bytes: int,
         near: TileId | None,
+        outcome: ExchangeOutcome[TileT],
         *,
         with_hashes: bool = False,
     ) -> dict[TileId, TileAnswer]:
         layer, district = self._holder.layer, tiles[0].district
         wanted = [HeldVersion(t, *held.get(t, NOTHING)) for t in tiles]
         codecs = codecs_of_layer(layer)
-        request = TilesRequest.of(wanted, codecs=codecs, max_bytes=max_bytes, near=near, with_hashes=with_hashes)
+        request = TilesRequest.of(
+            wanted,
+            codecs=codecs,
+            max_bytes=max_bytes,
+            near=near,
+            with_hashes=with_hashes,
+            ticket=self._ticket,
+            newest=self._wants_newest,
+        )
         payload = self._bus.request(
             batch_key(layer, district),
             request.encode(),
@@ -162,7 +185,10 @@ class Exchange(Generic[TileT]):
             timeout_s=self._timeout_s,
             shares_of=partial(shares_of, request, district),
         )
-        return dict(TilesReply.decode(payload).of_request(request, district))
+        reply = TilesReply.decode(payload)
+        answers = reply.of_request(request, district)
+        outcome.watched.update(answers[place][0] for place in reply.watched)
+        return dict(answers)
 
     def _take(self, tile_id: TileId, answer: TileAnswer, held: Head, outcome: ExchangeOutcome[TileT]) -> None:
         if answer.status in ("later", "hash"):

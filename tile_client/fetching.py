@@ -27,11 +27,13 @@ class TileServerClient:
         bus: an open bus.
         layer: name of the layer.
         timeout_s: how long one question is asked again before it fails.
+        newest: fetch the newest versions, also those that are on trial with a share of the vehicles.
     """
 
     bus: Bus
     layer: str
     timeout_s: float
+    newest: bool = False
 
     def catalog(self, region: Region) -> list[CatalogEntry]:
         """The newest version of each tile of the region, by tile.
@@ -55,7 +57,9 @@ class TileServerClient:
             RequestFailed: no answer, or one that is wrong twice.
             SchemaError: an answer that is none.
         """
-        exchange: Exchange[AnyTile] = Exchange(self.bus, TilesInMemory(self.layer, held), self.timeout_s)
+        exchange: Exchange[AnyTile] = Exchange(
+            self.bus, TilesInMemory(self.layer, held), self.timeout_s, newest=self.newest
+        )
         for _, group in groupby(sorted(tiles), key=lambda tile: tile.district):
             wanted, whole = list(group), {tile for tile in tiles if tile not in held}
             while wanted:

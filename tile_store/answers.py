@@ -25,6 +25,7 @@ from gnd.schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, Til
 from gnd.schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
 from gnd.tile_store.errors import StoreDamaged
 from gnd.tile_store.memory import Memory
+from gnd.tile_store.released import heads_for
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import StoredTile
 
@@ -78,8 +79,10 @@ class TileAnswers:
             SchemaError: nothing but bodies that cannot be decoded is left to send.
         """
         tiles = request.tiles(district)
-        heads = {entry.tile: entry for entry in self._store.heads(layer, district.path)}
-        held = self._held(layer, district, request, heads)
+        newest = {entry.tile: entry for entry in self._store.heads(layer, district.path)}
+        trials = self._store.trials(layer, district.path)
+        held = self._held(layer, district, request, newest)
+        heads = heads_for(request, newest, trials, held) if trials else newest
         answers = {tile: _without_body(heads.get(tile), held[tile]) for tile in tiles}
         wanting = [tile for tile in tiles if answers[tile].status == "later"]
         left, damaged = request.max_bytes, list[GndError]()
@@ -87,7 +90,8 @@ class TileAnswers:
             if left <= 0:
                 break
             try:
-                answer = self._answer(layer, tile, held[tile] or b"", request.codecs)
+                version = heads[tile].version if tile in trials else None
+                answer = self._answer(layer, tile, version, held[tile] or b"", request.codecs)
             except (SchemaError, CodecError, StoreDamaged) as error:
                 _LOG.error("tile %s cannot be sent: %s", tile, error)
                 damaged.append(error)
@@ -95,11 +99,16 @@ class TileAnswers:
             left, answers[tile] = _within(left, request.max_bytes, answer)
         if damaged and left == request.max_bytes:
             raise damaged[0]
-        return TilesReply(tuple(answers.values()))
+        watched = (place for place, tile in enumerate(tiles) if tile in trials) if request.ticket else ()
+        return TilesReply(tuple(answers.values()), tuple(watched))
 
-    def _answer(self, layer: str, tile: TileId, held: bytes, codecs: tuple[int, ...]) -> TileAnswer:
-        """The newest version for a client that holds the content with this hash (b"": none that the store knows)."""
-        stored = self._store.get(layer, tile)
+    def _answer(
+        self, layer: str, tile: TileId, version: int | None, held: bytes, codecs: tuple[int, ...]
+    ) -> TileAnswer:
+        """A version (None: the newest) for a client that holds the content with this hash (b"": none that the store
+        knows).
+        """
+        stored = self._store.get(layer, tile, version)
         if stored is None:
             return TileAnswer("absent")
         sent = self._sent(stored, self._by_sha(stored, held), codecs)

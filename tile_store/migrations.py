@@ -28,6 +28,7 @@ STEPS: Final = (
     (9, "schema_of_new_roads"),
     (10, "schema_of_turns"),
     (11, "schema_of_trust"),
+    (12, "schema_of_trials"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 _TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks")

@@ -17,6 +17,7 @@ from gnd.schemas.tiles import Catalog, TileRequest
 from gnd.schemas.tiles_batch import TilesRequest
 from gnd.tile_store.answers import TileAnswers, reads_layer
 from gnd.tile_store.regions import TileRegion
+from gnd.tile_store.released import released, released_heads
 from gnd.tile_store.store import Store
 from gnd.tile_store.warm import warm_up
 
@@ -33,6 +34,8 @@ CATALOG_ROOT: Final = keys.catalog_keys("x").removesuffix(_ANY)
 class TileServer:
     """Answers on every tile key and every catalog key, of all layers, exact or wildcard, and on keys for several tiles
     of a district.
+
+    Where a version is on trial, vehicles get it by their tickets (`released.heads_for`), all others the one before it.
 
     A request that can never be answered (bad key, bad payload, codecs that no tile comes in) is refused by name; a
     store that fails makes the asker try again.
@@ -74,7 +77,7 @@ class TileServer:
             wanted = TileRequest.decode(request.payload) if request.payload else PLAIN_REQUEST
             if not request.is_wild:
                 layer, tile = keys.parse_tile_key(request.key)
-                return self._answers.one(self._store.get(layer, tile), wanted).encode()
+                return self._answers.one(released(self._store, layer, tile), wanted).encode()
             region = TileRegion.of_key(request.key, TILE_ROOT)
         except SchemaError as error:
             raise _refusal(request, error) from None
@@ -105,7 +108,7 @@ class TileServer:
         try:
             if not request.is_wild:
                 layer, district = keys.parse_catalog_key(request.key)
-                return Catalog(tuple(self._store.heads(layer, district.path))).encode()
+                return self._catalog(layer, district)
             region = TileRegion.of_key(request.key, CATALOG_ROOT)
         except SchemaError as error:
             raise _refusal(request, error) from None
@@ -113,7 +116,7 @@ class TileServer:
 
     def _region(self, found: list[tuple[str, TileId]], wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
         for layer, tile in found:
-            yield keys.tile_key(layer, tile), self._answers.one(self._store.get(layer, tile), wanted).encode()
+            yield keys.tile_key(layer, tile), self._answers.one(released(self._store, layer, tile), wanted).encode()
 
     def _catalogs(self, region: TileRegion) -> Iterator[tuple[str, bytes]]:
         for (layer, district), _ in groupby(self._tiles(region), lambda found: (found[0], found[1].district)):
@@ -121,7 +124,7 @@ class TileServer:
                 yield keys.catalog_key(layer, district), self._catalog(layer, district)
 
     def _catalog(self, layer: str, district: District) -> bytes:
-        return Catalog(tuple(self._store.heads(layer, district.path))).encode()
+        return Catalog(tuple(released_heads(self._store, layer, district.path))).encode()
 
     def _tiles(self, region: TileRegion) -> Iterator[tuple[str, TileId]]:
         for layer in self._store.layers() if region.layer is None else [region.layer]:

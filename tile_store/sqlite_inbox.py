@@ -205,6 +205,12 @@ def of_windows(c: apsw.Connection, layer: str, tile: TileId, first: int, last: i
     return tuple(_row(*values) for values in fetch(c, "reports_of_windows", wanted))
 
 
+def of_report(c: apsw.Connection, layer: str, tile: TileId, report_id: str) -> list[ReportRow]:
+    """The parts of a report about a tile, in order."""
+    wanted = {"layer": layer, "tile": tile.morton, "report_id": report_id}
+    return [_row(*values) for values in fetch(c, "rows_of_report", wanted)]
+
+
 def page(c: apsw.Connection, layer: str, vehicle: str | None, after: int, n: int) -> tuple[int, list[ReportRow]]:
     """Up to `n` reports that arrived after number `after`, and the last one's number."""
     rows = fetch(c, "reports_page", {"layer": layer, "vehicle": vehicle, "after": after, "n": n})

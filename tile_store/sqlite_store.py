@@ -19,6 +19,7 @@ from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_journal as journal
 from gnd.tile_store import sqlite_refuted as refuted
 from gnd.tile_store import sqlite_roads as roads
+from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store import sqlite_trust as trust
 from gnd.tile_store import sqlite_uploads as uploads
 from gnd.tile_store import sqlite_versions as versions
@@ -30,6 +31,7 @@ from gnd.tile_store.retention import trim_quarantine
 from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.rows_kept import RowsKept
 from gnd.tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
+from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from gnd.tile_store.values import (
     DEFAULT_LAYER,
@@ -145,7 +147,8 @@ class SqliteStore:
             self.close()
             raise
 
-    def _timing(self) -> dict[str, Any]:
+    def timing(self) -> dict[str, Any]:
+        """Now, and when a tile that is marked becomes ready, as statements take it."""
         return inbox.timing_of(self._config, self._now_ns(), self._steady_ns())
 
     # Uploads
@@ -175,7 +178,7 @@ class SqliteStore:
 
     def settle_upload(self, settled: Settled) -> bool:
         """See `Store.settle_upload`."""
-        return self._writer.run(lambda c: uploads.settle(c, settled, self._config, self._timing()))
+        return self._writer.run(lambda c: uploads.settle(c, settled, self._config, self.timing()))
 
     def first_halves(self, key: str, report_id: str) -> list[FirstHalf]:
         """See `Store.first_halves`."""
@@ -216,7 +219,7 @@ class SqliteStore:
         """See `Store.put_reports`."""
         if not rows:
             return []
-        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._config, self._timing()))
+        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._config, self.timing()))
 
     def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
         """See `Store.reports`."""
@@ -409,7 +412,7 @@ class SqliteStore:
         pairs = [(one, None if one.tile is None else Content.of(one.tile)) for one in publications]
 
         def work(c: apsw.Connection) -> list[PublishResult]:
-            return [versions.publish(c, one, content, self._timing()) for one, content in pairs]
+            return [versions.publish(c, one, content, self.timing()) for one, content in pairs]
 
         return self._writer.run(work)
 
@@ -501,6 +504,18 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             rows = fetch(c, "dirty_tiles")
         return [DirtyTile(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
+
+    # Trials
+
+    def trials(self, layer: str, prefix: str = "") -> dict[TileId, VersionTrial]:
+        """See `Store.trials`."""
+        with self._readers.snapshot() as c:
+            return trials.open_trials(c, layer, prefix)
+
+    def doubted_vehicles(self, layer: str, tile: TileId) -> frozenset[str]:
+        """See `Store.doubted_vehicles`."""
+        with self._readers.snapshot() as c:
+            return trials.doubted_vehicles(c, layer, tile)
 
     # Reading
 

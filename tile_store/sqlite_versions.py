@@ -12,6 +12,7 @@ from gnd.tile_store import sqlite_confirmation as confirmation
 from gnd.tile_store import sqlite_inbox as inbox
 from gnd.tile_store import sqlite_journal as journal
 from gnd.tile_store import sqlite_refuted as refuted
+from gnd.tile_store import sqlite_trials as trials
 from gnd.tile_store import sqlite_trust as trust
 from gnd.tile_store.errors import StoreError, UnknownReports, UnknownVersion
 from gnd.tile_store.provenance import NOTHING, Provenance, encode_provenance
@@ -43,7 +44,7 @@ def publish(
     head = _head(c, claim.layer, claim.tile)
     if not inbox.holds(c, claim):
         return PublishResult("stale", head.version)
-    if head.version != publication.base_version:
+    if head.version != publication.base_version or trials.open_trial(c, claim.layer, claim.tile) is not None:
         inbox.postpone(c, claim, timing["steady"])  # ready at once, against the head as it is now
         return PublishResult("stale", head.version)
     _check_reports(c, publication)
@@ -52,6 +53,9 @@ def publish(
         provenance = Provenance.of(publication.report_ids, publication.voxel_reports)
         origin = _Origin(publication.reason, claim.owner, provenance)
         result = PublishResult("published", _append(c, claim.layer, claim.tile, content, origin, timing["now"]))
+        if publication.trial is not None and head.version and not is_feature_layer(claim.layer):
+            pair = head.version, result.version
+            trials.begin(c, claim.layer, claim.tile, pair, publication.trial, timing["now"])
     basis = publication.basis
     if basis is not None and result.status == "published":
         journal.put_basis(c, claim.layer, claim.tile, result.version, basis)
@@ -114,6 +118,12 @@ def stored(c: apsw.Connection, statement: str, layer: str, tile: TileId, **value
     return StoredTile(rows[0][0], TileId(rows[0][1]), *rows[0][2:]) if rows else None
 
 
+def sha_of(c: apsw.Connection, layer: str, tile: TileId, version: int) -> bytes:
+    """The hash of a version; empty: there is none."""
+    rows = fetch(c, "sha_of_version", {"layer": layer, "tile": tile.morton, "version": version})
+    return rows[0][0] if rows else b""
+
+
 def epoch_of(c: apsw.Connection, layer: str, tile: TileId) -> int:
     """The latest version of a tile that is a base or a rollback; 0 when there is none."""
     return _head(c, layer, tile).epoch
@@ -158,6 +168,7 @@ def _append(c: apsw.Connection, layer: str, tile: TileId, content: Content, orig
     if change(c, "swap_head" if head.version else "insert_head", row) != 1:
         raise StoreError(f"tile {tile.path} of layer {layer}: head {head.version} has moved inside a transaction")
     if origin.kind != "merged":  # a new epoch: what waited is forgotten with the reports that claimed it
+        trials.supersede(c, layer, tile, now)
         confirmation.keep(c, layer, tile, ())
         journal.begin_epoch(c, layer, tile, version)
     if head.version or origin.kind == "merged":  # what an import adds to the map is found through the catalog

@@ -1,6 +1,6 @@
 """What a store of tiles and reports can do, whatever keeps it. `tests/tile_store/` holds every implementation to it."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -8,6 +8,7 @@ from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_store.roads import RoadPart
+from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from gnd.tile_store.values import (
     DEFAULT_LAYER,
@@ -263,6 +264,14 @@ class Store(Protocol):
 
     def dirty_tiles(self) -> list[DirtyTile]:
         """Tiles that wait to be merged, by layer and tile."""
+
+    # Trials
+
+    def trials(self, layer: str, prefix: str = "") -> Mapping[TileId, VersionTrial]:
+        """The versions on trial of a region (a prefix of tile paths), by tile."""
+
+    def doubted_vehicles(self, layer: str, tile: TileId) -> frozenset[str]:
+        """The vehicles behind a version of a tile that was withdrawn, until their reports are cleared."""
 
     # Reading
 

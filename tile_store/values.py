@@ -17,6 +17,7 @@ from gnd.schemas.report_id import check_report_id
 from gnd.schemas.tiles import TileBlob, content_of, features_of, tile_of
 from gnd.schemas.wire import LAYER_PATTERN
 from gnd.tile_store.errors import StoreError
+from gnd.tile_store.trials import TrialTerms
 
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
@@ -602,7 +603,7 @@ class Publication:
     each changed feature, when known. `waiting` is what the reports claim and the content has not; None: as before.
     `shift_tests`, `agreement_tests` and `courses` are those of this tile's reports, which add to the accounts of their
     vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have come to,
-    where any was folded.
+    where any was folded. `trial`: who gets the version first; None: it is everybody's at once.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -619,6 +620,7 @@ class Publication:
     basis: Basis | None = None
     memory: StoredMemory | None = None
     closed: tuple[int, ...] = ()
+    trial: TrialTerms | None = None
 
     def __post_init__(self) -> None:
         if self.tile is not None and self.tile.tile_id != self.claim.tile:

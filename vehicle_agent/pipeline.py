@@ -87,7 +87,8 @@ class Localisation(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """Parts that a study replaces to measure what another one would do; the product leaves them as they are.
+    """Parts that a study replaces to measure what another one would do; the product leaves them as they are, and only
+    listens to what is `placed`.
 
     Attributes:
         localisation: made for a local map; None: the localiser of this vehicle.

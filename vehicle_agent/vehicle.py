@@ -12,15 +12,18 @@ from typing import Any
 from gnd.schemas.doubt import tiles_by_reason
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from gnd.schemas.errors import SchemaError
+from gnd.schemas.health import HealthReport
 from gnd.schemas.traffic import TrafficLine, TrafficSample
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.link.feature_tiles_on_the_bus import FeatureTilesOnTheBus, open_feature_tiles
 from gnd.vehicle_agent.link.link import Link, open_link
 from gnd.vehicle_agent.link.telemetry import Telemetry
 from gnd.vehicle_agent.link.tiles_on_the_bus import TilesOnTheBus
+from gnd.vehicle_agent.link.trial_telemetry import TrialTelemetry
 from gnd.vehicle_agent.local_map import LocalMap, Touched
+from gnd.vehicle_agent.localise.estimates import RefinedScan
 from gnd.vehicle_agent.memory import MemoryMeter
-from gnd.vehicle_agent.pipeline import Output, Pipeline, VehiclePipeline
+from gnd.vehicle_agent.pipeline import Output, Parts, Pipeline, VehiclePipeline
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.result import PoseEvaluation
@@ -45,12 +48,25 @@ class OnTheBus:
     stop: threading.Event
     updates: Counter[str] = field(default_factory=Counter)
     """Update notices of the voxel map, by what became of them."""
+    trials: TrialTelemetry | None = None
+    """What is told of tiles on trial; None: a vehicle that does not match scans with the voxel map."""
 
     def tiles(self, local_map: LocalMap, touched: Touched) -> TilesOnTheBus:
         """Make what fills a local map."""
         tiles = TilesOnTheBus(self.link, local_map, touched, self.config, self.stop)
         self.updates = tiles.updates.counts
+        registration = self.config.localise.registration
+        self.trials = TrialTelemetry(local_map, self.link.fetcher.watched, self.config.layer, registration)
         return tiles
+
+    def see(self, scan: RefinedScan) -> None:
+        """Take a scan whose pose has become final."""
+        if self.trials is not None:
+            self.trials.see(scan)
+
+    def health_reports(self, *, all_of_it: bool = False) -> list[HealthReport]:
+        """What there is to tell of tiles on trial."""
+        return [] if self.trials is None else self.trials.due(all_of_it=all_of_it)
 
 
 @dataclass(slots=True)
@@ -94,6 +110,8 @@ class AgentVehicle:
             self.memory.count_scan()
         output = self.pipeline.push(item)
         self.evaluation.estimates += output.poses
+        if isinstance(item, Scan) and self.bus.trials is not None:
+            self.bus.trials.note(self.pipeline.place)
         self.show(output, self.pipeline.place)
         self.way.note(self.pipeline.place)
         self.link.ledger.set_position(self.pipeline.place.odometer_m, item.t_ns)
@@ -197,7 +215,7 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[AgentVe
                 from gnd.vehicle_agent.link.ros2_output import Ros2Output
 
                 vehicle.show = Ros2Output(source.ros2.node, pipeline).take
-            telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample)
+            telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample, bus.health_reports)
             try:
                 yield vehicle
             finally:
@@ -218,5 +236,12 @@ def _pipeline(header: DriveHeader, fix: GnssFix, bus: OnTheBus) -> VehiclePipeli
 
         return GraphPipeline(fix, config.pipeline, identity, link.outbox, features)
     return Pipeline(
-        header, fix, bus.tiles, config.pipeline, identity=identity, outbox=link.outbox, feature_tiles=features
+        header,
+        fix,
+        bus.tiles,
+        config.pipeline,
+        identity=identity,
+        outbox=link.outbox,
+        feature_tiles=features,
+        parts=Parts(placed=(bus.see,)),
     )

@@ -69,6 +69,7 @@ class TilesReply(_message.Message):
     CODECS_FIELD_NUMBER: _builtins.int
     BODIES_FIELD_NUMBER: _builtins.int
     DAYS_FIELD_NUMBER: _builtins.int
+    WATCHED_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     hashes: _builtins.bytes
@@ -97,6 +98,12 @@ class TilesReply(_message.Message):
         looked so: of the survey, or of the merge that made the version. [days, 1 = 2000-01-01 UTC; 0 = not known]
         """
 
+    @_builtins.property
+    def watched(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Places (from 0, in the order of the request) of the tiles of which a version is on trial: the vehicle is asked to
+        say how it fares there (HealthReport), whichever version it has got.
+        """
+
     def __init__(
         self,
         *,
@@ -107,10 +114,11 @@ class TilesReply(_message.Message):
         codecs: _abc.Iterable[_builtins.int] | None = ...,
         bodies: _abc.Iterable[_builtins.bytes] | None = ...,
         days: _abc.Iterable[_builtins.int] | None = ...,
+        watched: _abc.Iterable[_builtins.int] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "days", b"days", "hashes", b"hashes", "major", b"major", "runs", b"runs", "versions", b"versions"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "days", b"days", "hashes", b"hashes", "major", b"major", "runs", b"runs", "versions", b"versions", "watched", b"watched"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

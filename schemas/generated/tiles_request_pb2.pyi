@@ -31,6 +31,8 @@ class TilesRequest(_message.Message):
     CODECS_FIELD_NUMBER: _builtins.int
     MAX_BYTES_FIELD_NUMBER: _builtins.int
     NEAR_FIELD_NUMBER: _builtins.int
+    TICKET_FIELD_NUMBER: _builtins.int
+    NEWEST_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     wanted: _builtins.bytes
@@ -51,6 +53,12 @@ class TilesRequest(_message.Message):
     """
     near: _builtins.int
     """Index of the tile whose surroundings are needed first, should not all fit."""
+    ticket: _builtins.int
+    """Where versions are released in stages: a number of the vehicle that chooses, by tile, whether it is among the first
+    to get a new one (schemas/ticket.py); 0 = the client is no vehicle, and gets what is released. [1 .. 65536]
+    """
+    newest: _builtins.bool
+    """The client wants the newest versions, released or not."""
     @_builtins.property
     def codecs(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """Codec ids that the client can read, in order of preference; empty = all of 0 to 7, the range coded first."""
@@ -65,10 +73,12 @@ class TilesRequest(_message.Message):
         codecs: _abc.Iterable[_builtins.int] | None = ...,
         max_bytes: _builtins.int = ...,
         near: _builtins.int | None = ...,
+        ticket: _builtins.int = ...,
+        newest: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "near", b"near"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "codecs", b"codecs", "held_digest", b"held_digest", "held_hashes", b"held_hashes", "major", b"major", "max_bytes", b"max_bytes", "near", b"near", "wanted", b"wanted"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "codecs", b"codecs", "held_digest", b"held_digest", "held_hashes", b"held_hashes", "major", b"major", "max_bytes", b"max_bytes", "near", b"near", "newest", b"newest", "ticket", b"ticket", "wanted", b"wanted"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__near: _TypeAlias = _typing.Literal["near"]  # noqa: Y015
     _WhichOneofArgType__near: _TypeAlias = _typing.Literal["_near", b"_near"]  # noqa: Y015

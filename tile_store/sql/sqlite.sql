@@ -428,6 +428,9 @@ ON CONFLICT (layer, tile) DO UPDATE SET
 -- name: claimable
 SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL, ready_ns FROM dirty INDEXED BY dirty_ready
 WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
+  -- a version of it is on trial: what is reported meanwhile waits for the verdict
+  AND NOT EXISTS (SELECT 1 FROM trial AS t INDEXED BY trial_open WHERE t.state IN ('trial', 'paused')
+    AND t.layer = dirty.layer AND t.tile = dirty.tile)
 ORDER BY ready_ns, layer, tile LIMIT :n
 
 -- name: take_lease
@@ -557,6 +560,8 @@ SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL
 
 -- name: next_ready
 SELECT MIN(CASE WHEN owner IS NULL THEN ready_ns ELSE MAX(ready_ns, lease_ns) END) FROM dirty
+WHERE NOT EXISTS (SELECT 1 FROM trial AS t INDEXED BY trial_open WHERE t.state IN ('trial', 'paused')
+    AND t.layer = dirty.layer AND t.tile = dirty.tile)
 
 -- name: insert_quarantine
 INSERT INTO quarantine (sha, received_ns, source, reason, times, body)
@@ -572,6 +577,8 @@ SELECT layer, tile FROM tile_version GROUP BY layer, tile HAVING COUNT(*) > :kee
 -- name: delete_old_versions
 DELETE FROM tile_version WHERE layer = :layer AND tile = :tile
   AND version < :oldest AND version <> :epoch
+  AND version NOT IN (SELECT base_version FROM trial
+                      WHERE layer = :layer AND tile = :tile AND state IN ('trial', 'paused'))
   AND sha NOT IN (SELECT base_sha FROM report
                   WHERE layer = :layer AND tile = :tile AND window > :folded
                     AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch))
@@ -807,7 +814,9 @@ SELECT messages, bytes FROM quarantine_size
 DELETE FROM quarantine WHERE sha IN (SELECT sha FROM quarantine ORDER BY received_ns, sha LIMIT 16)
 
 -- name: queue_state
-SELECT (SELECT MIN(ready_ns) FROM dirty WHERE aside_ns IS NULL),
+SELECT (SELECT MIN(ready_ns) FROM dirty WHERE aside_ns IS NULL
+  AND NOT EXISTS (SELECT 1 FROM trial AS t INDEXED BY trial_open WHERE t.state IN ('trial', 'paused')
+    AND t.layer = dirty.layer AND t.tile = dirty.tile)),
        (SELECT MIN(r.received_ns) FROM dirty AS d JOIN report AS r INDEXED BY report_waiting USING (layer, tile)
         WHERE r.merged_in IS NULL AND d.aside_ns IS NULL)
 
@@ -989,3 +998,159 @@ CREATE TABLE IF NOT EXISTS pardon (
 -- name: schema_of_turns
 -- Step of the schema: uploads that nobody has looked at, by vehicle, to look at those of all vehicles in turn.
 CREATE INDEX upload_turn ON upload (vehicle, upload) WHERE state = 'waiting' AND attempts = 0;
+
+-- name: schema_of_trials
+-- Step of the schema. Versions that only a share of the fleet gets at first. A version is on trial ("trial", "paused") until
+-- it is "released", "withdrawn" or "superseded" (by a base, or by a rollback that somebody asked for).
+CREATE TABLE trial (
+  layer TEXT NOT NULL,
+  tile INTEGER NOT NULL,
+  version INTEGER NOT NULL,
+  base_version INTEGER NOT NULL,
+  share REAL NOT NULL,
+  longest_ns INTEGER NOT NULL,
+  since_ns INTEGER NOT NULL,
+  state TEXT NOT NULL,
+  settled_ns INTEGER,
+  verdict TEXT NOT NULL DEFAULT '',
+  PRIMARY KEY (layer, tile, version)
+) WITHOUT ROWID;
+CREATE UNIQUE INDEX trial_open ON trial (layer, tile) WHERE state IN ('trial', 'paused');
+CREATE INDEX trial_settled ON trial (settled_ns) WHERE settled_ns IS NOT NULL;
+-- Who is among the first must not be foreseen.
+CREATE TABLE trial_salt (one INTEGER PRIMARY KEY CHECK (one = 1), salt BLOB NOT NULL);
+INSERT INTO trial_salt VALUES (1, randomblob(16));
+-- What vehicles have told of versions on trial and of those before them: one row, one vote a vehicle; gone when settled.
+CREATE TABLE trial_health (
+  layer TEXT NOT NULL,
+  tile INTEGER NOT NULL,
+  version INTEGER NOT NULL,
+  vehicle TEXT NOT NULL,
+  arm TEXT NOT NULL,
+  first_ns INTEGER NOT NULL,
+  t_ns INTEGER NOT NULL,
+  scans INTEGER NOT NULL,
+  matched INTEGER NOT NULL,
+  fit INTEGER NOT NULL,
+  elsewhere INTEGER NOT NULL,
+  inside INTEGER NOT NULL,
+  gated INTEGER NOT NULL,
+  not_good INTEGER NOT NULL,
+  has_left INTEGER NOT NULL,
+  PRIMARY KEY (layer, tile, version, vehicle)
+) WITHOUT ROWID;
+-- The reports behind a version that was withdrawn: their vehicles alone change nothing in this tile until they are cleared.
+CREATE TABLE doubted_report (
+  layer TEXT NOT NULL,
+  tile INTEGER NOT NULL,
+  version INTEGER NOT NULL,
+  report_id TEXT NOT NULL,
+  vehicle TEXT NOT NULL,
+  since_ns INTEGER NOT NULL,
+  cleared_ns INTEGER,
+  cleared_by TEXT NOT NULL DEFAULT '',
+  PRIMARY KEY (layer, tile, version, report_id)
+) WITHOUT ROWID;
+CREATE INDEX doubted_open ON doubted_report (layer, tile) WHERE cleared_ns IS NULL;
+-- Who did what to trials, and why.
+CREATE TABLE trial_steered (
+  at_ns INTEGER NOT NULL,
+  who TEXT NOT NULL,
+  action TEXT NOT NULL,
+  layer TEXT NOT NULL,
+  tile INTEGER NOT NULL,
+  version INTEGER NOT NULL,
+  why TEXT NOT NULL
+);
+CREATE INDEX trial_steered_tile ON trial_steered (layer, tile, at_ns);
+
+-- name: insert_trial
+INSERT INTO trial (layer, tile, version, base_version, share, longest_ns, since_ns, state)
+VALUES (:layer, :tile, :version, :base_version, :share, :longest_ns, :since_ns, 'trial')
+
+-- name: open_trials
+SELECT t.layer, t.tile, t.version, t.base_version, t.share, t.longest_ns, t.since_ns, t.state, t.settled_ns, t.verdict,
+       b.sha, n.sha
+FROM trial AS t INDEXED BY trial_open
+  JOIN tile_version AS b ON b.layer = t.layer AND b.tile = t.tile AND b.version = t.base_version
+  JOIN tile_version AS n ON n.layer = t.layer AND n.tile = t.tile AND n.version = t.version
+WHERE t.state IN ('trial', 'paused') AND t.layer = :layer AND t.tile >= :first AND t.tile < :end ORDER BY t.tile
+
+-- name: layers_on_trial
+SELECT DISTINCT layer FROM trial INDEXED BY trial_open WHERE state IN ('trial', 'paused') ORDER BY layer
+
+-- name: trials_of_tile
+SELECT layer, tile, version, base_version, share, longest_ns, since_ns, state, settled_ns, verdict FROM trial
+WHERE layer = :layer AND tile = :tile ORDER BY version
+
+-- name: settled_trials
+SELECT layer, tile, version, base_version, share, longest_ns, since_ns, state, settled_ns, verdict
+FROM trial INDEXED BY trial_settled WHERE settled_ns IS NOT NULL ORDER BY settled_ns DESC, layer, tile LIMIT :n
+
+-- name: set_trial
+UPDATE trial SET state = :state, settled_ns = :settled_ns, verdict = :verdict
+WHERE layer = :layer AND tile = :tile AND version = :version AND state IN ('trial', 'paused')
+
+-- name: forget_trials
+DELETE FROM trial WHERE settled_ns IS NOT NULL AND settled_ns <= (
+  SELECT settled_ns FROM trial INDEXED BY trial_settled WHERE settled_ns IS NOT NULL
+  ORDER BY settled_ns DESC LIMIT 1 OFFSET :keep)
+
+-- name: trial_salt
+SELECT salt FROM trial_salt
+
+-- name: put_trial_health
+INSERT INTO trial_health (layer, tile, version, vehicle, arm, first_ns, t_ns, scans, matched, fit, elsewhere, inside,
+                          gated, not_good, has_left)
+SELECT :layer, :tile, :version, :vehicle, :arm, :now, :t_ns, :scans, :matched, :fit, :elsewhere, :inside, :gated,
+       :not_good, :has_left
+WHERE (SELECT COUNT(*) FROM trial_health WHERE layer = :layer AND tile = :tile AND version = :version AND arm = :arm)
+      < :most
+  OR EXISTS (SELECT 1 FROM trial_health
+             WHERE layer = :layer AND tile = :tile AND version = :version AND vehicle = :vehicle)
+ON CONFLICT (layer, tile, version, vehicle) DO UPDATE SET
+  t_ns = excluded.t_ns, scans = excluded.scans, matched = excluded.matched, fit = excluded.fit,
+  elsewhere = excluded.elsewhere, inside = excluded.inside, gated = excluded.gated, not_good = excluded.not_good,
+  has_left = excluded.has_left
+WHERE excluded.t_ns > trial_health.t_ns AND excluded.arm = trial_health.arm
+  AND (excluded.scans + excluded.inside > 0 OR trial_health.scans + trial_health.inside = 0)
+
+-- name: trial_health
+SELECT vehicle, arm, first_ns, t_ns, scans, matched, fit, elsewhere, inside, gated, not_good, has_left FROM trial_health
+WHERE layer = :layer AND tile = :tile AND version = :version ORDER BY vehicle
+
+-- name: trial_told
+SELECT t_ns FROM trial_health
+WHERE layer = :layer AND tile = :tile AND version = :version AND vehicle = :vehicle
+
+-- name: forget_trial_health
+DELETE FROM trial_health WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: put_doubted_report
+INSERT INTO doubted_report (layer, tile, version, report_id, vehicle, since_ns)
+SELECT :layer, :tile, :version, report_id, vehicle, :now FROM report
+WHERE layer = :layer AND tile = :tile AND report_id IN (SELECT value FROM json_each(:ids)) GROUP BY report_id
+ON CONFLICT (layer, tile, version, report_id) DO NOTHING
+
+-- name: doubted_vehicles
+SELECT DISTINCT vehicle FROM doubted_report INDEXED BY doubted_open
+WHERE cleared_ns IS NULL AND layer = :layer AND tile = :tile
+
+-- name: doubted_reports
+SELECT version, report_id, vehicle, since_ns, cleared_ns, cleared_by FROM doubted_report
+WHERE layer = :layer AND tile = :tile ORDER BY version, report_id
+
+-- name: clear_doubted
+UPDATE doubted_report SET cleared_ns = :now, cleared_by = :who
+WHERE layer = :layer AND tile = :tile AND cleared_ns IS NULL
+
+-- name: steer
+INSERT INTO trial_steered (at_ns, who, action, layer, tile, version, why)
+VALUES (:now, :who, :action, :layer, :tile, :version, :why)
+
+-- name: steered
+SELECT at_ns, who, action, version, why FROM trial_steered WHERE layer = :layer AND tile = :tile ORDER BY at_ns, rowid
+
+-- name: rows_of_report
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+WHERE layer = :layer AND tile = :tile AND report_id = :report_id ORDER BY part

@@ -42,14 +42,16 @@ class TileFetcher(Generic[TileT]):
     try later. What has arrived is in the cache at once, so an agent that was killed goes on where it was.
     """
 
-    def __init__(self, bus: Bus, cache: TileCache[TileT], parameters: DownloadParameters) -> None:
+    def __init__(self, bus: Bus, cache: TileCache[TileT], parameters: DownloadParameters, ticket: int = 0) -> None:
         self.counts: Counter[str] = Counter()
         self.last_error = ""
         self.link: LinkProfile = bus.config.link_profile
         self._bus, self._cache, self._parameters = bus, cache, parameters
         self._offline = False
         # One attempt may take all the time there is: a second one would fetch a slow answer twice.
-        self._exchange: Exchange[TileT] = Exchange(bus, cache, parameters.request_s, parameters.request_s)
+        self._exchange: Exchange[TileT] = Exchange(
+            bus, cache, parameters.request_s, parameters.request_s, ticket=ticket
+        )
         rate_byte_s = self.link.rate_byte_s("down")
         self._batch_bytes = batch_bytes(rate_byte_s, DOWNLOAD_BATCH_S)
         # More on its way than the router keeps for us would be thrown away.
@@ -66,6 +68,7 @@ class TileFetcher(Generic[TileT]):
         self._stale: set[TileId] = set()  # answered, but to be asked for again
         self._wrong: Counter[TileId] = Counter()
         self._whole = _Mean(FIRST_GUESS_BYTES)
+        self._watched: set[TileId] = set()
         self._arrived: list[Fetched[TileT]] = []
         self._closed = False
         self._threads = [
@@ -108,12 +111,18 @@ class TileFetcher(Generic[TileT]):
             self._answered.discard(tile_id)
             self._answered_s.pop(tile_id, None)
             self._stale.discard(tile_id)
+            self._watched.discard(tile_id)
 
     def take(self) -> list[Fetched[TileT]]:
         """The answers since the last call."""
         with self._changed:
             arrived, self._arrived = self._arrived, []
             return arrived
+
+    def watched(self) -> frozenset[TileId]:
+        """The tiles of which a version was on trial when they were last answered."""
+        with self._changed:
+            return frozenset(self._watched)
 
     def is_known(self, tile_id: TileId) -> bool:
         """Whether there is or will be an answer without asking anew."""
@@ -230,6 +239,8 @@ class TileFetcher(Generic[TileT]):
 
     def _settle_all(self, batch: list[TileId], outcome: ExchangeOutcome[TileT], instead: dict[TileId, TileT]) -> None:
         """Note the answers; what has none waits for its next try. The lock is held."""
+        self._watched -= {fetched.tile_id for fetched in outcome.fetched}
+        self._watched |= outcome.watched
         for fetched in outcome.fetched:
             self._settle(fetched)
             self._whole.add(outcome.body_bytes.get(fetched.tile_id, 0 if fetched.status == "absent" else None))

@@ -10,6 +10,7 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.ledger import Ledger
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.keys import alive_key
+from gnd.schemas.ticket import ticket_of
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.link.download import TileFetcher
@@ -58,7 +59,8 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
         where = ", ".join(config.connect)
         _log.warning("%s: no router at %s for %g s: off on the cache", config.vehicle, where, config.open_timeout_s)
     bus.declare_alive(alive_key("agent", config.vehicle))
-    fetcher, sender = TileFetcher(bus, cache, config.download), SenderThread(bus, outbox, config.vehicle)
+    fetcher = TileFetcher(bus, cache, config.download, ticket_of(config.vehicle))
+    sender = SenderThread(bus, outbox, config.vehicle)
     try:
         yield Link(bus, ledger, cache, outbox, fetcher, sender)
     finally:

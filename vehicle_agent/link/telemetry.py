@@ -7,12 +7,13 @@ busy machine, or one that stands, has no more to say.
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import BusClosed, BusError
-from gnd.schemas.keys import traffic_key
+from gnd.schemas.health import HealthReport
+from gnd.schemas.keys import health_key, traffic_key
 from gnd.schemas.traffic import TrafficSample
 
 LOOK_S = 1.0
@@ -27,9 +28,26 @@ _log = logging.getLogger(__name__)
 
 
 class Telemetry:
-    """A thread of its own: a lost router must not stop the drive."""
+    """A thread of its own: a lost router must not stop the drive.
 
-    def __init__(self, bus: Bus, vehicle: str, sample: Callable[[], TrafficSample], *, look_s: float = LOOK_S) -> None:
+    Args:
+        bus: open.
+        vehicle: its pseudonym.
+        sample: what the vehicle says about itself now.
+        health: what there is to tell of tiles on trial; `all_of_it`: the drive has ended.
+        look_s: how often to look.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        vehicle: str,
+        sample: Callable[[], TrafficSample],
+        health: Callable[..., Sequence[HealthReport]] = lambda **_: (),
+        *,
+        look_s: float = LOOK_S,
+    ) -> None:
+        self._health, self._health_key = health, health_key(vehicle)
         self._bus, self._key, self._sample, self._look_s = bus, traffic_key(vehicle), sample, look_s
         self._said: TrafficSample | None = None
         self._began_ns = 0
@@ -41,10 +59,12 @@ class Telemetry:
         """Publish a last sample, which alone holds the ledger's totals by kind, and end the thread."""
         self._stop.set()
         self._thread.join()
+        self._publish_health(all_of_it=True)
         self._publish(self._sample())
 
     def _run(self) -> None:
         while not self._stop.wait(self._look_s):
+            self._publish_health()
             sample = self._sample()
             if self._is_news(sample):
                 self._publish(replace(sample, lines=()))
@@ -61,12 +81,19 @@ class Telemetry:
 
     def _publish(self, sample: TrafficSample) -> None:
         self._said = sample
+        self._put(self._key, sample.encode())
+
+    def _put(self, key: str, payload: bytes) -> None:
         try:
-            self._bus.publish(self._key, sample.encode(), kind="telemetry", wait_s=PUBLISH_WAIT_S)
+            self._bus.publish(key, payload, kind="telemetry", wait_s=PUBLISH_WAIT_S)
         except BusClosed:
             self._stop.set()
         except BusError as error:
             _log.info("sample not published: %s", error)
+
+    def _publish_health(self, *, all_of_it: bool = False) -> None:
+        for report in self._health(all_of_it=all_of_it):
+            self._put(self._health_key, report.encode())
 
 
 def _well_being(sample: TrafficSample) -> tuple[object, ...]:
