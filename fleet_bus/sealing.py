@@ -120,8 +120,16 @@ class Sealing:
         """Seal a notice."""
         return self._signer.notice(key, payload).encode()
 
-    def check_question(self, key: str, payload: bytes, attachment: bytes) -> tuple[Holder | None, bytes]:
+    def check_question(
+        self, key: str, payload: bytes, attachment: bytes, handler: int = 0
+    ) -> tuple[Holder | None, bytes]:
         """Who asks, where that matters, and what the answers are to be bound to.
+
+        Args:
+            key: that was asked.
+            payload: of the question.
+            attachment: with its seal.
+            handler: number of who answers: a question may reach several handlers of a session, each once.
 
         Raises:
             CertificateWanted: the certificate is not known here.
@@ -145,7 +153,7 @@ class Sealing:
         if holder is None:
             raise CertificateWanted("certificate wanted")
         self._check(seal, holder, wanted, key, payload, b"")
-        self._note_nonce(seal.certificate_id + seal.nonce)
+        self._note_nonce(seal.certificate_id + seal.nonce + handler.to_bytes(8, "little"))
         return holder, digest
 
     def check_answer(self, asked: str, key: str, payload: bytes, attachment: bytes, digest: bytes) -> bool:

@@ -138,7 +138,7 @@ class Serving(Part):
         sealing = self._connection.sealing
         if sealing is not None:
             try:
-                asker, digest = sealing.check_question(key, payload, attachment)
+                asker, digest = sealing.check_question(key, payload, attachment, id(self))
             except CertificateWanted:
                 raise
             except SealError as error:

@@ -1014,11 +1014,11 @@ CREATE TABLE trial (
   settled_ns INTEGER,
   verdict TEXT NOT NULL DEFAULT '',
   PRIMARY KEY (layer, tile, version)
-) WITHOUT ROWID;
+) STRICT, WITHOUT ROWID;
 CREATE UNIQUE INDEX trial_open ON trial (layer, tile) WHERE state IN ('trial', 'paused');
 CREATE INDEX trial_settled ON trial (settled_ns) WHERE settled_ns IS NOT NULL;
 -- Who is among the first must not be foreseen.
-CREATE TABLE trial_salt (one INTEGER PRIMARY KEY CHECK (one = 1), salt BLOB NOT NULL);
+CREATE TABLE trial_salt (one INTEGER PRIMARY KEY CHECK (one = 1), salt BLOB NOT NULL) STRICT;
 INSERT INTO trial_salt VALUES (1, randomblob(16));
 -- What vehicles have told of versions on trial and of those before them: one row, one vote a vehicle; gone when settled.
 CREATE TABLE trial_health (
@@ -1038,7 +1038,7 @@ CREATE TABLE trial_health (
   not_good INTEGER NOT NULL,
   has_left INTEGER NOT NULL,
   PRIMARY KEY (layer, tile, version, vehicle)
-) WITHOUT ROWID;
+) STRICT, WITHOUT ROWID;
 -- The reports behind a version that was withdrawn: their vehicles alone change nothing in this tile until they are cleared.
 CREATE TABLE doubted_report (
   layer TEXT NOT NULL,
@@ -1050,7 +1050,7 @@ CREATE TABLE doubted_report (
   cleared_ns INTEGER,
   cleared_by TEXT NOT NULL DEFAULT '',
   PRIMARY KEY (layer, tile, version, report_id)
-) WITHOUT ROWID;
+) STRICT, WITHOUT ROWID;
 CREATE INDEX doubted_open ON doubted_report (layer, tile) WHERE cleared_ns IS NULL;
 -- Who did what to trials, and why.
 CREATE TABLE trial_steered (
@@ -1061,7 +1061,7 @@ CREATE TABLE trial_steered (
   tile INTEGER NOT NULL,
   version INTEGER NOT NULL,
   why TEXT NOT NULL
-);
+) STRICT;
 CREATE INDEX trial_steered_tile ON trial_steered (layer, tile, at_ns);
 
 -- name: insert_trial
