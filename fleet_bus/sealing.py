@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from gnd.fleet_bus.errors import BusError, NotMine, SealError
-from gnd.fleet_bus.seal_keys import KnownCertificates, load_authority, load_signer
+from gnd.fleet_bus.seal_keys import KnownCertificates, certificates_of, holder_of, load_authority, load_signer
 from gnd.fleet_bus.seals import (
     ANSWERED_BY,
     ASKED_BY,
@@ -77,19 +77,19 @@ class Sealing:
 
     @classmethod
     def of_folder(cls, folder: Path) -> Self:
-        """From an identity folder.
+        """From an identity folder. Whether its certificate is good is for others to say: they are told by whom.
 
         Raises:
             BusConfigError: a file is missing or cannot be read.
-            SealError: the own certificate is none of the authority, has ended or was revoked.
+            SealError: the certificate names no part of a fleet.
         """
-        signer, certificates = load_signer(folder), load_authority(folder)
-        return cls(signer, certificates, certificates.learn(signer.chain))
+        signer = load_signer(folder)
+        return cls(signer, load_authority(folder), holder_of(certificates_of(signer.chain)[0]))
 
     def renew(self, folder: Path) -> None:
         """Sign with the certificate that lies in the folder now; errors as `of_folder`."""
         signer = load_signer(folder)
-        self.own = self._certificates.learn(signer.chain)
+        self.own = holder_of(certificates_of(signer.chain)[0])
         self._signers = (signer, *self._signers[:1])
 
     @property
