@@ -172,6 +172,34 @@ def _targets(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
     ]
 
 
+def _sleeps(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
+    """Honest in the first half of its tiles, in the order in which it drives; then it lies."""
+    return _by_turn(reports, lambda tile, share: _rebuilds(tile, lies) if share >= 0.5 else tile)
+
+
+def _drifts(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
+    """A shift that grows from tile to tile."""
+
+    def moved(tile: TileChange, share: float) -> TileChange:
+        was = lies.base.get(tile.tile, Gaussians.empty())
+        return _says(tile, _moved(tile.tile, _seen_base(tile, lies), lambda at_m: at_m + share * _SHIFT_M, was), was)
+
+    return _by_turn(reports, moved)
+
+
+def _by_turn(
+    reports: Sequence[ChangeReport], change: Callable[[TileChange, float], TileChange]
+) -> list[ChangeReport]:
+    """Each tile changed by its turn among all that the vehicle tells of, 0 to 1, by the time of its report."""
+    ordered = sorted(reports, key=lambda one: (one.last_ns, one.report_id))
+    n = max(sum(len(one.tiles) for one in ordered) - 1, 1)
+    found, turn = list[ChangeReport](), 0
+    for one in ordered:
+        found.append(replace(one, tiles=tuple(change(tile, (turn + k) / n) for k, tile in enumerate(one.tiles))))
+        turn += len(one.tiles)
+    return found
+
+
 def _lies_partly(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
     """Its honest changes, and lies among them."""
 
@@ -195,6 +223,8 @@ KINDS: Final[dict[str, Lie]] = {
     "colluding": _each_tile(_rebuilds),
     "targeted": _targets,
     "partly": _lies_partly,
+    "sleeper": _sleeps,
+    "drift": _drifts,
 }
 TOGETHER: Final = frozenset({"colluding", "targeted"})
 MIXED: Final = ("miscalibrated", "shifted", "deletes_all", "inserts", "repeats", "replays", "partly")
