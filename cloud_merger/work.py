@@ -199,7 +199,11 @@ class Worker:
         named = names_of(self._store.refuted_reports(layer, {row.vehicle for row in rows}), rows)
         merger = LayerMerger(tile, self._config.merge_of(layer), self._feature_bases(work), refuted_of(named))
         state, merges, closed = _through_windows(
-            LayerState.stored(epoch, journal.memory), windows_of(rows), journal.window, lambda _window, state, said: merger.merge(state, said), merger.fold
+            LayerState.stored(epoch, journal.memory),
+            windows_of(rows),
+            journal.window,
+            lambda _window, state, said: merger.merge(state, said),
+            merger.fold,
         )
         new = FeatureTile(tile, work.base_version + 1, merges[-1].features)
         return replace(

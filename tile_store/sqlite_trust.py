@@ -53,8 +53,13 @@ def put_tests(
             told = {"vehicle": vehicle, "since_ns": timing["now"], "source": "agreement", "why": why}
             change(c, "quarantine_vehicle", told)
             _merge_its_tiles_again(c, vehicle, timing)
-        elif is_news and not is_bad and vehicle in known and change(c, "release_vehicle", {"vehicle": vehicle, "any": 0}):
+        elif vehicle in known and is_news and not is_bad and _let_out(c, vehicle):
             _merge_its_tiles_again(c, vehicle, timing)
+
+
+def _let_out(c: apsw.Connection, vehicle: str) -> bool:
+    """Whom an operator has taken out stays out."""
+    return change(c, "release_vehicle", {"vehicle": vehicle, "any": 0}) > 0
 
 
 def is_outdated(c: apsw.Connection, layer: str, basis: Basis | None) -> bool:

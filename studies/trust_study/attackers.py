@@ -187,9 +187,7 @@ def _drifts(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
     return _by_turn(reports, moved)
 
 
-def _by_turn(
-    reports: Sequence[ChangeReport], change: Callable[[TileChange, float], TileChange]
-) -> list[ChangeReport]:
+def _by_turn(reports: Sequence[ChangeReport], change: Callable[[TileChange, float], TileChange]) -> list[ChangeReport]:
     """Each tile changed by its turn among all that the vehicle tells of, 0 to 1, by the time of its report."""
     ordered = sorted(reports, key=lambda one: (one.last_ns, one.report_id))
     n = max(sum(len(one.tiles) for one in ordered) - 1, 1)

@@ -113,7 +113,7 @@ def test_attack_slander(cloud: Cloud) -> None:
 
 
 def test_attack_a_name_that_marks_another(cloud: Cloud) -> None:
-    """A pseudonym with the mark of the quarantined, to push a name into the basis of a version: it cannot be written."""
+    """A pseudonym with the mark of the quarantined, to push a name into the basis of a version: it is refused."""
     street = Street(cloud, 8)
     with pytest.raises(Exception, match="vehicle"):
         street.report("!honest", street.gone)

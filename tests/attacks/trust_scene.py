@@ -14,8 +14,8 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "cloud_merger"))
-from merger_processes import Cloud, wait_for  # noqa: E402
-from merger_world import BALL, GROUND, WALL, State, change_of, gaussians_of, report_of  # noqa: E402
+from merger_processes import Cloud, wait_for
+from merger_world import BALL, GROUND, WALL, State, change_of, gaussians_of, report_of
 
 SHARD = "guarded"
 FIRST = 497353963152
@@ -84,7 +84,7 @@ class Street:
         self.sent += 1
         at_ns = NS + (60 * self.sent if at_s is None else at_s) * 10**9
         tiles = [
-            change_of(base(tile), sorted({*base(tile).voxel_id.tolist(), *free(tile)}), changes.get(tile, {}), tile=tile)
+            change_of(base(tile), sorted([*base(tile).voxel_id, *free(tile)]), changes.get(tile, {}), tile=tile)
             for tile in self.tiles
         ]
         made = report_of(1000 * self.number + self.sent, *tiles, vehicle=self.name(vehicle))
@@ -97,9 +97,9 @@ class Street:
 
     def settle(self) -> None:
         """Until all is merged and announced."""
-        wait_for("all is merged", self.cloud.is_settled, 90.0)
+        wait_for("all is merged", self.cloud.is_settled, 200.0)  # a new machine compiles the kernels first
         time.sleep(0.1)
-        wait_for("all is merged", self.cloud.is_settled, 90.0)
+        wait_for("all is merged", self.cloud.is_settled, 200.0)
 
     def quarantined(self) -> set[str]:
         """Those of this street whose reports do not count."""

@@ -1,4 +1,4 @@
-"""What a vehicle has published is taken back when it does not count any more, from closed windows, too, and replayed."""
+"""What a vehicle has published is taken back when it does not count any more, from closed windows, too."""
 
 from collections.abc import Iterable
 from pathlib import Path
