@@ -102,9 +102,9 @@ def _around(voxel_id: NDArray[np.int32], which: Mask) -> tuple[I64, I64]:
     first = np.append(True, voxel_id[1:] != voxel_id[:-1])[: len(voxel_id)]
     group = np.cumsum(first) - 1
     until = np.cumsum(which)
-    start = (until - which)[first][group]
+    start: I64 = (until - which)[first][group]
     total = np.bincount(group, weights=which).astype(np.int64)[group]
-    before = until - which - start
+    before: I64 = until - which - start
     return before, total - before - which
 
 

@@ -80,12 +80,24 @@ def quarantined(c: apsw.Connection) -> list[VehicleTrust]:
 def trust_of(c: apsw.Connection, vehicle: str) -> VehicleTrust:
     """What the newest tests of a vehicle say, tile by tile, and whether it is quarantined."""
     rows = fetch(c, "agreement_tests_of_vehicle", {"vehicle": vehicle, "n": NEWEST_TESTS})
-    sums = [sum(row[column] for row in rows) for column in range(1, 5)]
+    claims, wrong_claims, quotes, wrong_quotes = (sum(row[column] for row in rows) for column in range(1, 5))
     state = next((one for one in quarantined(c) if one.vehicle == vehicle), None)
     refuted = sum(1 for row in rows if row[5])
     if state is None:
-        return VehicleTrust(vehicle, len(rows), refuted, *sums, False)
-    return VehicleTrust(vehicle, len(rows), refuted, *sums, True, state.by, state.why, state.since_ns)
+        return VehicleTrust(vehicle, len(rows), refuted, claims, wrong_claims, quotes, wrong_quotes, False)
+    return VehicleTrust(
+        vehicle,
+        len(rows),
+        refuted,
+        claims,
+        wrong_claims,
+        quotes,
+        wrong_quotes,
+        True,
+        state.by,
+        state.why,
+        state.since_ns,
+    )
 
 
 def trusts(c: apsw.Connection) -> list[VehicleTrust]:

@@ -182,7 +182,13 @@ def _drifts(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
 
     def moved(tile: TileChange, share: float) -> TileChange:
         was = lies.base.get(tile.tile, Gaussians.empty())
-        return _says(tile, _moved(tile.tile, _seen_base(tile, lies), lambda at_m: at_m + share * _SHIFT_M, was), was)
+        return _says(
+            tile,
+            _moved(
+                tile.tile, _seen_base(tile, lies), lambda at_m: np.asarray(at_m + share * _SHIFT_M, np.float64), was
+            ),
+            was,
+        )
 
     return _by_turn(reports, moved)
 
