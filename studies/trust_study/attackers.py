@@ -75,7 +75,9 @@ def _moved(tile: TileId, seen: Gaussians, to_m: Callable[[F64], F64], was: Gauss
     """Where the Gaussians of a tile are measured when points are moved, and what is missed where they are."""
     grid = VoxelGrid.of(tile)
     ix, iy, floor = grid.unravel(seen.voxel_id)
-    at_m = np.column_stack([ix, iy, floor]) + 0.5 + seen.mean_m  # voxels are one metre, near enough
+    at_m = np.column_stack([ix, iy, floor]) + np.asarray(
+        0.5 + seen.mean_m, np.float64
+    )  # voxels are one metre, near enough
     to = to_m(at_m)
     cell = np.floor(to).astype(np.int64)
     inside = ((cell >= 0) & (cell < [grid.nx, grid.ny, 1 << 30])).all(axis=1)
@@ -103,7 +105,9 @@ def _turned(change: TileChange, lies: Lies) -> TileChange:
     c, s = np.cos(_TURN_RAD), np.sin(_TURN_RAD)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     about = np.array([15.0, -10.0, 0.0])  # the vehicle drives beside the middle: most is far from it
-    return _says(change, _moved(change.tile, seen, lambda at_m: (at_m - about) @ turn + about, was), was)
+    return _says(
+        change, _moved(change.tile, seen, lambda at_m: np.asarray((at_m - about) @ turn + about, np.float64), was), was
+    )
 
 
 def _deletes_all(change: TileChange, lies: Lies) -> TileChange:
