@@ -78,7 +78,7 @@ def _moved(tile: TileId, seen: Gaussians, to_m: Callable[[F64], F64], was: Gauss
     at_m = np.column_stack([ix, iy, floor]) + np.asarray(
         0.5 + seen.mean_m, np.float64
     )  # voxels are one metre, near enough
-    to = to_m(at_m)
+    to = to_m(np.asarray(at_m, np.float64))
     cell = np.floor(to).astype(np.int64)
     inside = ((cell >= 0) & (cell < [grid.nx, grid.ny, 1 << 30])).all(axis=1)
     ids = np.zeros(len(seen), np.int32)
