@@ -30,8 +30,9 @@ REFUTED_QUOTES: Final = 0.8
 """... or this share of what it says is as it was, where they say that it has changed: that is missed more easily."""
 DENIED_CLAIM: Final = 2
 DENIED_QUOTE: Final = 3
-"""So many others must contradict a statement, and more than agree with it. Of a claim those who came later count: what
-has just changed is contradicted by nobody who came before. Of "as it was" those count who came earlier."""
+"""So many others must contradict a statement, and more than say it, the vehicle itself among them. Of a claim those who
+came later contradict: what has just changed is contradicted by nobody who came before. Of "as it was" those who came
+earlier do."""
 CONTRADICTED_VOXELS: Final = 8
 CONTRADICTED_SHARE: Final = 0.5
 """Who is contradicted in so many voxels of a tile, and in this share of what others can judge, is not believed alone
@@ -81,11 +82,14 @@ def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> A
         np.where(gone, gone_before + gone_after, there_before + there_after),
         quotes_before + quotes_after,
     )
-    agree = np.where(gone, gone_after, np.where(there, there_after, quotes_before))
+    # who agrees counts whenever it came, and so does the vehicle itself: three that lie first must not make those wrong
+    # who come after them, before the others have
+    agree = np.where(gone, gone_before + gone_after, there_before + there_after)
+    agree = np.where(claim, agree, quotes_before + quotes_after)
     deny = np.where(claim, quotes_after, np.maximum(gone_before, there_before))
     least = np.where(claim, DENIED_CLAIM, DENIED_QUOTE)
     judged = (agree + deny >= least) & (claim | quotes)
-    refuted = judged & (deny >= least) & (deny > agree)
+    refuted = judged & (deny >= least) & (deny > agree + 1)
     tests = []
     for number, report in enumerate(reports):
         own = rows["report"] == number
@@ -98,9 +102,9 @@ def _around(voxel_id: NDArray[np.int32], which: Mask) -> tuple[I64, I64]:
     first = np.append(True, voxel_id[1:] != voxel_id[:-1])[: len(voxel_id)]
     group = np.cumsum(first) - 1
     until = np.cumsum(which)
-    start = (until - which)[first][group]
+    start: I64 = (until - which)[first][group]
     total = np.bincount(group, weights=which).astype(np.int64)[group]
-    before = until - which - start
+    before: I64 = until - which - start
     return before, total - before - which
 
 

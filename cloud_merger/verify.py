@@ -22,7 +22,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
 from gnd.tile_store.store import Store
-from gnd.tile_store.values import Basis, ClosedWindow, ReportRow, StoredTile, VersionInfo
+from gnd.tile_store.values import Basis, ClosedWindow, ReportRow, StoredTile, VersionInfo, counted_out
 
 Status = Literal["same", "differs", "given", "unknown"]
 
@@ -66,7 +66,9 @@ class _Journal:
         """How one of its windows was merged."""
         if window == self.basis.window:
             return ClosedWindow(self.basis.named, self.basis.parameters)
-        return self.closed.get(window, ClosedWindow(frozenset()))
+        how = self.closed.get(window, ClosedWindow(frozenset()))
+        # who is quarantined counts in no window: all are folded anew when that changes
+        return ClosedWindow(how.named - counted_out(how.named) | counted_out(self.basis.named), how.parameters)
 
     @property
     def windows_before(self) -> list[int]:

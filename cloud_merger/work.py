@@ -9,7 +9,7 @@ from gnd.cloud_merger.belief import ShiftTests, courses_of
 from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.features.kept import FeatureContents, said_of
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
-from gnd.cloud_merger.map_parameters import text_of
+from gnd.cloud_merger.map_parameters import text_of, with_text
 from gnd.cloud_merger.snapping import REMEMBERED_TILES, Snapping
 from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window
 from gnd.cloud_merger.window import WindowMerger, fold, provenance_of
@@ -18,10 +18,21 @@ from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import Feature, FeatureTile, is_feature_layer
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
 from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownReports
 from gnd.tile_store.store import Store
-from gnd.tile_store.values import QUARANTINED, Basis, Claim, Publication, PublishResult, ReportRow, TileWork
+from gnd.tile_store.values import (
+    QUARANTINED,
+    Basis,
+    Claim,
+    ClosedWindow,
+    Publication,
+    PublishResult,
+    ReportRow,
+    TileWork,
+    counted_out,
+)
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -101,8 +112,11 @@ class Worker:
             self._set_aside(claim, "no shard that merged it came to an end")
             return None
         try:
+            named = self._named(
+                claim.layer, claim.tile
+            )  # before the tile is read: the store refuses what both together do not fit
             work = self._store.load(claim)
-            return self._of_features(work) if is_feature_layer(claim.layer) else self._of_gaussians(work)
+            return self._of_features(work) if is_feature_layer(claim.layer) else self._of_gaussians(work, named)
         except StoreError as error:
             if not isinstance(error, StoreDamaged):
                 raise  # the store's failure, not the tile's
@@ -119,22 +133,28 @@ class Worker:
         else:
             self._store.postpone(claim, RETRY_S * claim.attempts)
 
-    def _of_gaussians(self, work: TileWork) -> Publication:
+    def _named(self, layer: str, tile: TileId) -> frozenset[str]:
+        """Who is shifted again and again, who does not count, and who is behind a version of this tile that was
+        withdrawn: alone they change nothing here until they are cleared.
+        """
+        out = (QUARANTINED + vehicle for vehicle in self._store.quarantined_vehicles())
+        return self._store.shifted_vehicles().union(out, self._store.doubted_vehicles(layer, tile))
+
+    def _of_gaussians(self, work: TileWork, named: frozenset[str]) -> Publication:
         """Of a tile of the voxel map."""
         tile, config = work.claim.tile, self._config
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
-        out = (QUARANTINED + vehicle for vehicle in self._store.quarantined_vehicles())
-        # behind a version that was withdrawn: alone they change nothing here until they are cleared
-        doubted = self._store.doubted_vehicles(work.claim.layer, tile)
-        named = self._store.shifted_vehicles().union(out, doubted)
-        merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named, self._snapping)
+        now_so = ClosedWindow(named, self._parameters)
         lattice = lattice_of_tile(work.epoch, epoch, config.codec)
         by_window = reports_by_window(work.reports, config.merge, self._unreadable)
+        # windows that were closed before and are folded anew, because somebody else counts now
+        again = self._folded_before(work, by_window, named)
+        mergers = {how: self._merger(work, how) for how in {now_so, *again.values()}}
         state, merges, closed = _through_windows(
             self._contents.state(tile, work.journal),
             by_window,
             work.journal.window,
-            lambda state, reports: merger.merge(state, reports or [], lattice),
+            lambda window, state, reports: mergers[again.get(window, now_so)].merge(state, reports or [], lattice),
             lambda state, merged, _reports: fold(state, merged),
         )
         now, version = merges[-1], work.base_version + 1
@@ -142,14 +162,39 @@ class Worker:
         new = self._made.of(now.gaussians, lambda: Tile(tile, version, now.gaussians), (tile, version))
         self._contents.keep(new)
         return replace(
-            self._publication(work, new, len(new.gaussians), named, closed),
+            self._publication(work, new, len(new.gaussians), named, [one for one in closed if one not in again]),
             voxel_reports=provenance_of(merges),
             waiting=now.gated.waiting,
             shift_tests=tuple(test for one in merges for test in one.believed.tests),
-            agreement_tests=tuple(test for one in merges for test in one.agreement),
+            agreement_tests=tuple(
+                test
+                for window, one in zip([*closed, work.journal.window], merges, strict=True)
+                for test in one.agreement
+                if window not in again  # judged when it was closed
+            ),
             courses=courses_of(one for reports in by_window.values() for one in reports),
             memory=encode_state(tile, closed[-1], state) if closed else None,
         )
+
+    def _folded_before(
+        self, work: TileWork, by_window: Mapping[int, object], named: frozenset[str]
+    ) -> dict[int, ClosedWindow]:
+        """Of the closed windows those that were folded before: as then, but for who does not count now."""
+        if all(window >= work.journal.window for window in by_window):
+            return {}
+        told = self._store.closed_windows(work.claim.layer, work.claim.tile)
+        return {
+            window: ClosedWindow(told[window].named - counted_out(told[window].named) | counted_out(named),
+                                 told[window].parameters or self._parameters)
+            for window in by_window
+            if window < work.journal.window and window in told
+        }  # fmt: skip
+
+    def _merger(self, work: TileWork, how: ClosedWindow) -> WindowMerger:
+        config = self._config if how.parameters == self._parameters else with_text(self._config, how.parameters)
+        shifts = self._shifts
+        bases = self._bases(work)
+        return WindowMerger(config.merge, config.confirmation, shifts, bases, how.named, self._snapping)
 
     def _of_features(self, work: TileWork) -> Publication:
         """Of a tile of a feature layer."""
@@ -159,7 +204,11 @@ class Worker:
         named = names_of(self._store.refuted_reports(layer, {row.vehicle for row in rows}), rows)
         merger = LayerMerger(tile, self._config.merge_of(layer), self._feature_bases(work), refuted_of(named))
         state, merges, closed = _through_windows(
-            LayerState.stored(epoch, journal.memory), windows_of(rows), journal.window, merger.merge, merger.fold
+            LayerState.stored(epoch, journal.memory),
+            windows_of(rows),
+            journal.window,
+            lambda _window, state, said: merger.merge(state, said),
+            merger.fold,
         )
         new = FeatureTile(tile, work.base_version + 1, merges[-1].features)
         return replace(
@@ -236,7 +285,7 @@ def _through_windows(
     state: StateT,
     by_window: Mapping[int, ReportsT],
     open_window: int,
-    merge: Callable[[StateT, ReportsT | None], MergedT],
+    merge: Callable[[int, StateT, ReportsT | None], MergedT],
     fold_in: Callable[[StateT, MergedT, ReportsT], StateT],
 ) -> tuple[StateT, list[MergedT], list[int]]:
     """Fold the windows that are closed into the state, then merge the open one.
@@ -246,7 +295,7 @@ def _through_windows(
     """
     closed, merges = [window for window in sorted(by_window) if window < open_window], list[MergedT]()
     for window in closed:
-        merges.append(merge(state, by_window[window]))
+        merges.append(merge(window, state, by_window[window]))
         state = fold_in(state, merges[-1], by_window[window])
-    merges.append(merge(state, by_window.get(open_window)))
+    merges.append(merge(open_window, state, by_window.get(open_window)))
     return state, merges, closed

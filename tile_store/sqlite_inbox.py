@@ -29,6 +29,8 @@ LOOKED_AT: Final = 8
 """Times as many of the oldest tiles as can be claimed are looked at for preferred ones."""
 HALVES_WAIT: Final = 4
 """Merge delays that a tile waits for the Gaussians that were asked for, if nothing else is said about it."""
+CONTESTED_VOXELS: Final = 12
+"""Where one vehicle alone claims so many changes of a tile, those are merged, too, who say that nothing has changed."""
 NEVER_AT_ONCE: Final = 1 << 30
 
 
@@ -74,6 +76,8 @@ def _version_that_it_confirms(c: apsw.Connection, row: ReportRow) -> int | None:
     head = fetch(c, "head", place)
     if not head or head[0][2] != row.base_sha or fetch(c, "dirty_row", place):
         return None
+    if fetch(c, "much_waits", place | {"least": CONTESTED_VOXELS}):
+        return None  # it contradicts somebody, which the merge enters
     return int(head[0][0])
 
 
@@ -161,12 +165,15 @@ def holds(c: apsw.Connection, claim: Claim) -> bool:
     return any(token == claim.token for _, token in rows)
 
 
-def consume(c: apsw.Connection, claim: Claim, seq: int, version: int, timing: dict[str, Any]) -> None:
-    """The tile's reports up to number `seq` are merged in `version`; the tile is clean unless there are more."""
+def consume(c: apsw.Connection, claim: Claim, seq: int, version: int, timing: dict[str, Any]) -> bool:
+    """The tile's reports up to number `seq` are merged in `version`; the tile is clean unless there are more. Whether
+    any was merged for the first time.
+    """
     place: dict[str, Any] = {"layer": claim.layer, "tile": claim.tile.morton}
-    change(c, "consume_reports", place | {"version": version, "seq": seq})
+    is_news = change(c, "consume_reports", place | {"version": version, "seq": seq}) > 0
     if not change(c, "clean", place | {"seq": seq}):
         change(c, "still_dirty", place | timing)
+    return is_news
 
 
 def unknown_reports(c: apsw.Connection, claim: Claim, report_ids: Iterable[str]) -> list[str]:

@@ -119,6 +119,20 @@ def folded(c: apsw.Connection, layer: str, tile: TileId, epoch: int) -> int:
     return int(rows[0][0]) if rows else first_window(c, layer, tile, epoch) - 1
 
 
+def reopen(c: apsw.Connection, layer: str, tile: TileId, epoch: int) -> bool:
+    """Forget what the closed windows of a tile have come to, so that the next merge folds all of them anew; False: it
+    stays, for retention has removed reports of theirs.
+    """
+    place = {"layer": layer, "tile": tile.morton}
+    began = basis_of(c, layer, tile, epoch)
+    wanted = place | {"first": NO_WINDOWS if began is None else began.window}
+    oldest = fetch(c, "oldest_since_epoch", wanted)[0][0]
+    if oldest is None or oldest > (0 if began is None else began.seq) + 1:  # the oldest are removed first
+        return False
+    change(c, "forget_memory", place)
+    return True
+
+
 def keep(
     c: apsw.Connection,
     layer: str,

@@ -483,11 +483,11 @@ class SqliteStore:
 
     def quarantine_vehicle(self, vehicle: str, why: str) -> None:
         """See `Store.quarantine_vehicle`."""
-        self._writer.run(lambda c: trust.quarantine(c, vehicle, why, self._timing()))
+        self._writer.run(lambda c: trust.quarantine(c, vehicle, why, self.timing()))
 
     def release_vehicle(self, vehicle: str) -> bool:
         """See `Store.release_vehicle`."""
-        return self._writer.run(lambda c: trust.release(c, vehicle, self._timing()))
+        return self._writer.run(lambda c: trust.release(c, vehicle, self.timing()))
 
     def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
         """See `Store.refuted_reports`."""

@@ -5,11 +5,13 @@ from typing import Any, Final
 
 import apsw
 
+from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import sqlite_journal as journal
 from gnd.tile_store.sqlite_accounts import NEWEST_TESTS, ids_of
 from gnd.tile_store.sqlite_connection import change, fetch
 from gnd.tile_store.sqlite_inbox import merge_again
-from gnd.tile_store.values import AgreementTest, VehicleTrust
+from gnd.tile_store.values import QUARANTINED, AgreementTest, Basis, VehicleTrust, counted_out
 
 REFUTED_TILES: Final = 3
 """A vehicle does not count any more when others have contradicted it in so many tiles, ..."""
@@ -18,10 +20,18 @@ REFUTED_SHARE: Final = 0.5
 
 
 def put_tests(
-    c: apsw.Connection, layer: str, tile: TileId, tests: Iterable[AgreementTest], timing: dict[str, Any]
+    c: apsw.Connection,
+    layer: str,
+    tile: TileId,
+    tests: Iterable[AgreementTest],
+    timing: dict[str, Any],
+    is_news: bool = True,
 ) -> None:
     """Enter the tests of a tile. Where that puts a vehicle into quarantine, or lets it out, all tiles that it has
     reported about are merged again.
+
+    `is_news`: a report was merged for the first time. Nobody is let out without one: merging again without a vehicle
+    is no new evidence, and could let it in and out for ever.
     """
     made, vehicles = list(tests), set()
     place = {"layer": layer, "tile": tile.morton}
@@ -43,8 +53,20 @@ def put_tests(
             told = {"vehicle": vehicle, "since_ns": timing["now"], "source": "agreement", "why": why}
             change(c, "quarantine_vehicle", told)
             _merge_its_tiles_again(c, vehicle, timing)
-        elif not is_bad and vehicle in known and change(c, "release_vehicle", {"vehicle": vehicle, "any": 0}):
+        elif vehicle in known and is_news and not is_bad and _let_out(c, vehicle):
             _merge_its_tiles_again(c, vehicle, timing)
+
+
+def _let_out(c: apsw.Connection, vehicle: str) -> bool:
+    """Whom an operator has taken out stays out."""
+    return change(c, "release_vehicle", {"vehicle": vehicle, "any": 0}) > 0
+
+
+def is_outdated(c: apsw.Connection, layer: str, basis: Basis | None) -> bool:
+    """Whether somebody has come into quarantine or out of it since a merge was begun: it may mix both."""
+    if basis is None or is_feature_layer(layer):
+        return False
+    return counted_out(basis.named) != {QUARANTINED + one.vehicle for one in quarantined(c)}
 
 
 def quarantined(c: apsw.Connection) -> list[VehicleTrust]:
@@ -58,12 +80,24 @@ def quarantined(c: apsw.Connection) -> list[VehicleTrust]:
 def trust_of(c: apsw.Connection, vehicle: str) -> VehicleTrust:
     """What the newest tests of a vehicle say, tile by tile, and whether it is quarantined."""
     rows = fetch(c, "agreement_tests_of_vehicle", {"vehicle": vehicle, "n": NEWEST_TESTS})
-    sums = [sum(row[column] for row in rows) for column in range(1, 5)]
+    claims, wrong_claims, quotes, wrong_quotes = (sum(row[column] for row in rows) for column in range(1, 5))
     state = next((one for one in quarantined(c) if one.vehicle == vehicle), None)
     refuted = sum(1 for row in rows if row[5])
     if state is None:
-        return VehicleTrust(vehicle, len(rows), refuted, *sums, False)
-    return VehicleTrust(vehicle, len(rows), refuted, *sums, True, state.by, state.why, state.since_ns)
+        return VehicleTrust(vehicle, len(rows), refuted, claims, wrong_claims, quotes, wrong_quotes, False)
+    return VehicleTrust(
+        vehicle,
+        len(rows),
+        refuted,
+        claims,
+        wrong_claims,
+        quotes,
+        wrong_quotes,
+        True,
+        state.by,
+        state.why,
+        state.since_ns,
+    )
 
 
 def trusts(c: apsw.Connection) -> list[VehicleTrust]:
@@ -89,5 +123,12 @@ def release(c: apsw.Connection, vehicle: str, timing: dict[str, Any]) -> bool:
 
 
 def _merge_its_tiles_again(c: apsw.Connection, vehicle: str, timing: dict[str, Any]) -> None:
-    for layer, tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
-        merge_again(c, layer, TileId(tile), timing)
+    """All tiles that it has spoken of since their epochs; windows that hold a report of it are folded anew."""
+    for layer, morton, is_folded in fetch(c, "tiles_spoken_of", {"vehicle": vehicle}):
+        if is_feature_layer(layer):
+            continue  # features weigh their observers themselves
+        tile = TileId(morton)
+        if is_folded:
+            head = fetch(c, "head", {"layer": layer, "tile": morton})
+            journal.reopen(c, layer, tile, head[0][1] if head else 0)
+        merge_again(c, layer, tile, timing)

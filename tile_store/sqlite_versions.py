@@ -44,7 +44,8 @@ def publish(
     head = _head(c, claim.layer, claim.tile)
     if not inbox.holds(c, claim):
         return PublishResult("stale", head.version)
-    if head.version != publication.base_version or trials.open_trial(c, claim.layer, claim.tile) is not None:
+    is_old = head.version != publication.base_version or trust.is_outdated(c, claim.layer, publication.basis)
+    if is_old or trials.open_trial(c, claim.layer, claim.tile) is not None:
         inbox.postpone(c, claim, timing["steady"])  # ready at once, against the head as it is now
         return PublishResult("stale", head.version)
     _check_reports(c, publication)
@@ -63,21 +64,21 @@ def publish(
         how = ClosedWindow(basis.named, basis.parameters)
         closed = dict.fromkeys(publication.closed, how)
         journal.keep(c, claim.layer, claim.tile, head.epoch, publication.memory, closed)
-    inbox.consume(c, claim, claim.seq if basis is None else basis.seq, result.version, timing)
+    is_news = inbox.consume(c, claim, claim.seq if basis is None else basis.seq, result.version, timing)
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
     accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
-    _put_tests(c, publication, timing)
+    _put_tests(c, publication, timing, is_news)
     return result
 
 
-def _put_tests(c: apsw.Connection, publication: Publication, timing: dict[str, Any]) -> None:
+def _put_tests(c: apsw.Connection, publication: Publication, timing: dict[str, Any], is_news: bool) -> None:
     """The accounts of the vehicles, and which of their reports about features are refuted now."""
     claim, tests = publication.claim, publication.shift_tests
     vehicles = {test.vehicle for test in tests} if is_feature_layer(claim.layer) else set()
     before = refuted.refuted(c, claim.layer, vehicles)
     accounts.put_tests(c, claim.layer, claim.tile, tests, timing)
-    trust.put_tests(c, claim.layer, claim.tile, publication.agreement_tests, timing)
+    trust.put_tests(c, claim.layer, claim.tile, publication.agreement_tests, timing, is_news)
     refuted.merge_again(c, claim.layer, before, refuted.refuted(c, claim.layer, vehicles), timing)
 
 

@@ -28,6 +28,12 @@ WaitingReason = Literal[
 QUARANTINED: Final = "!"
 """Before the name of a vehicle among those named: its reports do not count at all."""
 
+
+def counted_out(named: frozenset[str]) -> frozenset[str]:
+    """Those of the names that say whose reports do not count, as they stand there."""
+    return frozenset(name for name in named if name.startswith(QUARANTINED))
+
+
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
 DEFAULT_CODEC: Final = "standard"

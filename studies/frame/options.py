@@ -23,7 +23,7 @@ import click
 from studies.frame.errors import OptionError
 
 PATH: Final = click.Path(path_type=Path)
-SEEDS: Final = ("--seeds", "--world-seed")
+SEEDS: Final = ("--seeds", "--seed", "--world-seed")
 T = TypeVar("T")
 
 

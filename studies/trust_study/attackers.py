@@ -75,8 +75,10 @@ def _moved(tile: TileId, seen: Gaussians, to_m: Callable[[F64], F64], was: Gauss
     """Where the Gaussians of a tile are measured when points are moved, and what is missed where they are."""
     grid = VoxelGrid.of(tile)
     ix, iy, floor = grid.unravel(seen.voxel_id)
-    at_m = np.column_stack([ix, iy, floor]) + 0.5 + seen.mean_m  # voxels are one metre, near enough
-    to = to_m(at_m)
+    at_m = np.column_stack([ix, iy, floor]) + np.asarray(
+        0.5 + seen.mean_m, np.float64
+    )  # voxels are one metre, near enough
+    to = to_m(np.asarray(at_m, np.float64))
     cell = np.floor(to).astype(np.int64)
     inside = ((cell >= 0) & (cell < [grid.nx, grid.ny, 1 << 30])).all(axis=1)
     ids = np.zeros(len(seen), np.int32)
@@ -103,7 +105,9 @@ def _turned(change: TileChange, lies: Lies) -> TileChange:
     c, s = np.cos(_TURN_RAD), np.sin(_TURN_RAD)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     about = np.array([15.0, -10.0, 0.0])  # the vehicle drives beside the middle: most is far from it
-    return _says(change, _moved(change.tile, seen, lambda at_m: (at_m - about) @ turn + about, was), was)
+    return _says(
+        change, _moved(change.tile, seen, lambda at_m: np.asarray((at_m - about) @ turn + about, np.float64), was), was
+    )
 
 
 def _deletes_all(change: TileChange, lies: Lies) -> TileChange:
@@ -172,6 +176,38 @@ def _targets(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
     ]
 
 
+def _sleeps(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
+    """Honest in the first half of its tiles, in the order in which it drives; then it lies."""
+    return _by_turn(reports, lambda tile, share: _rebuilds(tile, lies) if share >= 0.5 else tile)
+
+
+def _drifts(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
+    """A shift that grows from tile to tile."""
+
+    def moved(tile: TileChange, share: float) -> TileChange:
+        was = lies.base.get(tile.tile, Gaussians.empty())
+        return _says(
+            tile,
+            _moved(
+                tile.tile, _seen_base(tile, lies), lambda at_m: np.asarray(at_m + share * _SHIFT_M, np.float64), was
+            ),
+            was,
+        )
+
+    return _by_turn(reports, moved)
+
+
+def _by_turn(reports: Sequence[ChangeReport], change: Callable[[TileChange, float], TileChange]) -> list[ChangeReport]:
+    """Each tile changed by its turn among all that the vehicle tells of, 0 to 1, by the time of its report."""
+    ordered = sorted(reports, key=lambda one: (one.last_ns, one.report_id))
+    n = max(sum(len(one.tiles) for one in ordered) - 1, 1)
+    found, turn = list[ChangeReport](), 0
+    for one in ordered:
+        found.append(replace(one, tiles=tuple(change(tile, (turn + k) / n) for k, tile in enumerate(one.tiles))))
+        turn += len(one.tiles)
+    return found
+
+
 def _lies_partly(reports: Sequence[ChangeReport], lies: Lies) -> list[ChangeReport]:
     """Its honest changes, and lies among them."""
 
@@ -195,6 +231,8 @@ KINDS: Final[dict[str, Lie]] = {
     "colluding": _each_tile(_rebuilds),
     "targeted": _targets,
     "partly": _lies_partly,
+    "sleeper": _sleeps,
+    "drift": _drifts,
 }
 TOGETHER: Final = frozenset({"colluding", "targeted"})
 MIXED: Final = ("miscalibrated", "shifted", "deletes_all", "inserts", "repeats", "replays", "partly")

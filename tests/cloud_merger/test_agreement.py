@@ -173,6 +173,16 @@ def test_one_wrong_tile_is_forgiven(store: SqliteStore) -> None:
     assert shas(store) == UNTOUCHED
 
 
+def test_three_that_lie_first_name_none_of_those_who_come_after(store: SqliteStore) -> None:
+    """Also not while only as many have come as have lied."""
+    take(store, [one for number, name in enumerate("xyz", 1) for one in says(number, name, GONE)])
+    take(store, [one for number, name in enumerate("abc", 4) for one in says(number, name, NOTHING)])
+    assert store.quarantined_vehicles() == frozenset()
+    take(store, [one for number, name in enumerate("de", 7) for one in says(number, name, NOTHING)])
+    assert store.quarantined_vehicles() <= set("xyz")
+    assert shas(store) == UNTOUCHED
+
+
 def test_the_order_of_arrival_decides_nothing(tmp_path: Path) -> None:
     fleet = [says(3, "a", NOTHING), says(1, "bad", GONE), says(4, "b", NOTHING), says(2, "worse", BUILT)]
     ends = []

@@ -356,6 +356,16 @@ GROUP BY layer, tile ORDER BY MAX(at_ns) DESC, layer, tile LIMIT :n
 -- name: newest_agreement_test
 SELECT COALESCE(MAX(at_ns), 0) FROM agreement_test WHERE vehicle = :vehicle
 
+-- name: tiles_spoken_of
+SELECT r.layer, r.tile, MAX(r.window <= COALESCE(m.window, -1)) FROM report AS r
+  LEFT JOIN tile_head AS h USING (layer, tile)
+  LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
+WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
+GROUP BY r.layer, r.tile
+
+-- name: oldest_since_epoch
+SELECT MIN(seq) FROM report WHERE layer = :layer AND tile = :tile AND window >= :first
+
 -- name: judged_vehicles
 SELECT vehicle FROM agreement_test UNION SELECT vehicle FROM quarantined_vehicle ORDER BY vehicle
 
@@ -388,6 +398,10 @@ SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING 
   LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
 WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
   AND r.window > COALESCE(m.window, -1)
+
+-- name: much_waits
+SELECT 1 FROM waiting_change
+WHERE layer = :layer AND tile = :tile AND reason IN ('share', 'contradicted') AND voxels >= :least LIMIT 1
 
 -- name: delete_waiting
 DELETE FROM waiting_change WHERE layer = :layer AND tile = :tile

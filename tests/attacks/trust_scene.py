@@ -1,0 +1,124 @@
+"""A router, a store and a shard as processes, streets of four tiles, and what vehicles say of them over the bus."""
+
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile, content_sha
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "cloud_merger"))
+from merger_processes import Cloud, wait_for
+from merger_world import BALL, GROUND, WALL, State, change_of, gaussians_of, report_of
+
+SHARD = "guarded"
+FIRST = 497353963152
+STREETS = 15
+NS = 1_700_000_000_000_000_000
+WIDE = 24
+Changes = Mapping[TileId, Mapping[int, State | None]]
+NOTHING: Changes = {}
+
+
+def _voxels(tile: TileId, row: int, floors: tuple[int, ...]) -> list[int]:
+    grid = VoxelGrid.of(tile)
+    return sorted(int(grid.voxel_id(3 + n, row, floor)) for n in range(WIDE) for floor in floors)
+
+
+def wall(tile: TileId) -> list[int]:
+    """Voxels of the wall that the map holds."""
+    return _voxels(tile, 10, (40, 41))
+
+
+def free(tile: TileId) -> list[int]:
+    """Voxels in which the map holds nothing, two floors high like a wall."""
+    return _voxels(tile, 13, (40, 41))
+
+
+def base(tile: TileId) -> Gaussians:
+    """The tile as the map has it."""
+    ground = [voxel for row in (7, 8, 9, 10) for voxel in _voxels(tile, row, (39,))]
+    return gaussians_of(dict.fromkeys(wall(tile), WALL) | dict.fromkeys(ground, GROUND))
+
+
+@dataclass
+class Street:
+    """Four tiles of their own, on which one attack is tried."""
+
+    cloud: Cloud
+    number: int
+    tiles: list[TileId] = field(default_factory=list)
+    sent: int = 0
+
+    def __post_init__(self) -> None:
+        self.tiles = [TileId(FIRST + 4 * self.number + k) for k in range(4)]
+
+    @property
+    def untouched(self) -> list[bytes]:
+        return [content_sha(tile, base(tile)) for tile in self.tiles]
+
+    @property
+    def shas(self) -> list[bytes]:
+        return [head.sha for tile in self.tiles if (head := self.cloud.store.get("ndt", tile)) is not None]
+
+    @property
+    def gone(self) -> Changes:
+        return {tile: dict.fromkeys(wall(tile), None) for tile in self.tiles}
+
+    @property
+    def built(self) -> Changes:
+        return {tile: dict.fromkeys(free(tile), BALL) for tile in self.tiles}
+
+    def name(self, vehicle: str) -> str:
+        """Vehicles of one street are not those of another."""
+        return f"{vehicle}-{self.number}"
+
+    def report(self, vehicle: str, changes: Changes, at_s: int | None = None) -> ChangeReport:
+        """What a vehicle says of all tiles; all else is as in the map. Vehicles drive a minute after each other."""
+        self.sent += 1
+        at_ns = NS + (60 * self.sent if at_s is None else at_s) * 10**9
+        tiles = [
+            change_of(base(tile), sorted([*base(tile).voxel_id, *free(tile)]), changes.get(tile, {}), tile=tile)
+            for tile in self.tiles
+        ]
+        made = report_of(1000 * self.number + self.sent, *tiles, vehicle=self.name(vehicle))
+        return replace(made, first_ns=at_ns - 20 * 10**9, last_ns=at_ns)
+
+    def say(self, vehicle: str, changes: Changes, at_s: int | None = None) -> None:
+        """Send it over the bus; it is acknowledged."""
+        ack = self.cloud.send(self.report(vehicle, changes, at_s))
+        assert ack.status in ("stored", "duplicate"), ack
+
+    def settle(self) -> None:
+        """Until all is merged and announced."""
+        wait_for("all is merged", self.cloud.is_settled, 200.0)  # a new machine compiles the kernels first
+        time.sleep(0.1)
+        wait_for("all is merged", self.cloud.is_settled, 200.0)
+
+    def quarantined(self) -> set[str]:
+        """Those of this street whose reports do not count."""
+        end = f"-{self.number}"
+        return {one.removesuffix(end) for one in self.cloud.store.quarantined_vehicles() if one.endswith(end)}
+
+    def reasons(self, vehicle: str) -> set[str]:
+        """Why claims of a vehicle wait."""
+        return {one.reason for one in self.cloud.store.waiting_changes() if one.vehicle == self.name(vehicle)}
+
+
+@contextmanager
+def guarded_cloud(folder: Path, port: int) -> Iterator[Cloud]:
+    """A cloud with all streets."""
+    cloud = Cloud(folder, port)
+    cloud.open()
+    try:
+        cloud.store.put_tiles([Tile(one, 1, base(one)) for n in range(STREETS) for one in Street(cloud, n).tiles])
+        cloud.start(SHARD)
+        yield cloud
+    finally:
+        cloud.close()
