@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gnd.fleet_bus.errors import BusConfigError, SealError
+from gnd.fleet_bus.errors import IdentityError, SealError
 from gnd.fleet_bus.seals import Holder, Signer, certificate_id
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def certificates_of(chain: bytes) -> list["x509.Certificate"]:
 
 
 def holder_of(certificate: "x509.Certificate") -> Holder:
-    """Whom a certificate names: its common name is `<role>.<name>`, its unit the role.
+    """Whom a certificate names: its common name is `<role>.<name>`.
 
     Raises:
         SealError: it names no part of a fleet, or its key is none on P-256.
@@ -134,18 +134,19 @@ def holder_of(certificate: "x509.Certificate") -> Holder:
         values = [str(attribute.value) for attribute in certificate.subject.get_attributes_for_oid(oid)]
         return values[0] if len(values) == 1 else ""
 
-    common, role = said(NameOID.COMMON_NAME), said(NameOID.ORGANIZATIONAL_UNIT_NAME)
+    common = said(NameOID.COMMON_NAME)
+    role, _, name = common.partition(".")
     try:
         key = certificate.public_key()
     except ValueError as error:
         raise SealError(f"the key of certificate {common!r} cannot be read: {error}") from None
-    if not role or not common.startswith(f"{role}.") or not isinstance(key, ec.EllipticCurvePublicKey):
-        raise SealError(f"certificate {common[:80]!r} of unit {role[:80]!r} names no part of a fleet")
+    if not role or not name or not isinstance(key, ec.EllipticCurvePublicKey):
+        raise SealError(f"certificate {common[:80]!r} names no part of a fleet")
     if not isinstance(key.curve, ec.SECP256R1):
         raise SealError(f"the key of certificate {common[:80]!r} is on {key.curve.name}, not on P-256")
     return Holder(
         role=role,
-        name=common.removeprefix(f"{role}."),
+        name=name,
         owner=said(NameOID.ORGANIZATION_NAME),
         certificate_id=certificate_id(certificate.public_bytes(Encoding.DER)),
         ends_s=certificate.not_valid_after_utc.timestamp(),
@@ -214,7 +215,7 @@ def load_signer(folder: Path) -> Signer:
     """The signer of an identity folder: `certificate.pem` and `key.pem`.
 
     Raises:
-        BusConfigError: a file is missing or cannot be read, or the key is not the certificate's.
+        IdentityError: a file is missing or cannot be read, or the key is not the certificate's.
     """
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -224,9 +225,9 @@ def load_signer(folder: Path) -> Signer:
         chain = x509.load_pem_x509_certificates((folder / "certificate.pem").read_bytes())
         key = load_pem_private_key((folder / "key.pem").read_bytes(), password=None)
     except (OSError, ValueError, TypeError) as error:
-        raise BusConfigError(f"identity {folder}: {error}") from None
+        raise IdentityError(f"identity {folder}: {error}") from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != chain[0].public_key():
-        raise BusConfigError(f"identity {folder}: key.pem is not the key of certificate.pem")
+        raise IdentityError(f"identity {folder}: key.pem is the key of another certificate")
     return Signer(key, tuple(one.public_bytes(Encoding.DER) for one in chain))
 
 
@@ -234,7 +235,7 @@ def load_authority(folder: Path) -> KnownCertificates:
     """Whom an identity folder trusts: `authority.pem`, and `revoked.pem` where it is there.
 
     Raises:
-        BusConfigError: the file is missing or cannot be read.
+        IdentityError: the file is missing or cannot be read.
     """
     from cryptography import x509
 
@@ -243,4 +244,4 @@ def load_authority(folder: Path) -> KnownCertificates:
             x509.load_pem_x509_certificates((folder / "authority.pem").read_bytes()), folder / "revoked.pem"
         )
     except (OSError, ValueError) as error:
-        raise BusConfigError(f"identity {folder}: {error}") from None
+        raise IdentityError(f"identity {folder}: {error}") from None

@@ -80,7 +80,7 @@ class Sealing:
         """From an identity folder. Whether its certificate is good is for others to say: they are told by whom.
 
         Raises:
-            BusConfigError: a file is missing or cannot be read.
+            IdentityError: a file is missing or cannot be read.
             SealError: the certificate names no part of a fleet.
         """
         signer = load_signer(folder)

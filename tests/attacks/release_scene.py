@@ -69,7 +69,8 @@ class ReleaseCloud(Cloud):
         """Each of these vehicles reports this of a tile, and the shards have looked at it."""
         for car in cars:
             change = change_of(BASE, [0, 1, 2], changed, tile=tile, version=version)
-            assert self.send(report_of(next(self._numbers), change, vehicle=car)).status == "stored"
+            ack = self.send(report_of(next(self._numbers), change, vehicle=car))
+            assert ack.status == "stored", ack
         is_done = lambda: "waiting" not in self.store.upload_counts().by_state  # noqa: E731
         wait_for("the reports are looked at", is_done)
 
