@@ -143,7 +143,7 @@ def _check_cloud(cloud: PointCloud, dtype: np.dtype[np.void], size: int) -> None
     if missing:
         raise BadValue(f"points lack {', '.join(sorted(missing))}; deskewing needs the time of each point")
     _check_types(dtype)
-    fields = dtype.fields or {}
+    fields: Mapping[str, Any] = dtype.fields or {}
     spans = sorted((field[1], field[1] + field[0].itemsize) for field in fields.values())
     if any(end > start for (_, end), (start, _) in pairwise(spans)):
         raise BadValue(f"point fields {', '.join(fields)} at bytes {[start for start, _ in spans]} overlap")
