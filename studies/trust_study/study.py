@@ -106,7 +106,8 @@ def run_kind(files: WorldFiles, vehicles: Sequence[VehicleFile], kind: str, shar
         fleet.append(lies[-1])
     clean = run_cloud(scorer.base, [reports for number, reports in enumerate(honest) if number not in bad])
     dirty = run_cloud(scorer.base, fleet)
-    return _row(scorer, clean, dirty, lies, len(honest))
+    true = [one for number, reports in enumerate(honest) if number not in bad for one in reports]
+    return _row(scorer, clean, dirty, lies, true, len(honest))
 
 
 def bad_ones(n: int, kind: str, share: float, seed: int) -> list[int]:
@@ -116,11 +117,16 @@ def bad_ones(n: int, kind: str, share: float, seed: int) -> list[int]:
 
 
 def _row(
-    scorer: MapScorer, clean: CloudRun, dirty: CloudRun, lies: Sequence[Sequence[ChangeReport]], n: int
+    scorer: MapScorer,
+    clean: CloudRun,
+    dirty: CloudRun,
+    lies: Sequence[Sequence[ChangeReport]],
+    true: Sequence[ChangeReport],
+    n: int,
 ) -> dict[str, Any]:
     bad = {one.vehicle for reports in lies for one in reports}
     named = dirty.quarantined & bad
-    claims, published = false_published(scorer.base.tiles, clean.tiles, dirty.tiles, lies)
+    claims, published = false_published(scorer.base.tiles, clean.tiles, dirty.tiles, lies, true)
     f1, without = scorer.score(dirty.tiles).f1(), scorer.score(clean.tiles).f1()
     return {
         "f1": f1,
@@ -141,12 +147,17 @@ def false_published(
     clean: Mapping[TileId, Gaussians],
     dirty: Mapping[TileId, Gaussians],
     lies: Sequence[Sequence[ChangeReport]],
+    true: Sequence[ChangeReport],
 ) -> tuple[int, int]:
-    """Voxels that bad vehicles call changed and the others do not; how many of them the map has changed."""
-    claims = published = 0
+    """Voxels that bad vehicles call changed and no honest one does; how many of them the map has changed.
+
+    What an honest vehicle has found, too, is no lie: a bad one that says the same by chance is its second witness.
+    """
+    claims, published = 0, 0
+    found, nothing = claimed(true), np.zeros(0, np.int32)
     for tile, ids in claimed([one for reports in lies for one in reports]).items():
         was, now, then = (tiles.get(tile, Gaussians.empty()) for tiles in (base, dirty, clean))
-        false = ids[_same(was, then, ids)]
+        false = np.setdiff1d(ids[_same(was, then, ids)], found.get(tile, nothing))
         claims += len(false)
         published += int((~_same(was, now, false)).sum())
     return claims, published
