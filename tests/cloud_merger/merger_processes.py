@@ -23,7 +23,7 @@ from gnd.schemas.keys import alive_keys, change_key, parse_alive_key, update_key
 from gnd.schemas.updates import TileUpdate
 from gnd.tile_store.sqlite_store import SqliteStore
 
-DEADLINE_S = 30.0
+DEADLINE_S = 90.0
 FAST = """poll_s = 0.05
 bus_lease_ms = 1500
 [store]
