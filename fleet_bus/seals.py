@@ -5,10 +5,9 @@ the part's certificate (ECDSA on P-256, SHA-256), over the key expression, the p
 
 - of a question: the time, and a number that is used once;
 - of an answer: the question that it answers, number included. So an answer cannot be kept and given again, and no clock
-  is needed to know that it is new;
-- of a notice: the time.
+  is needed to know that it is new.
 
-So neither a router nor a cache nor another client can invent, alter or repeat what matters. What may be withheld is
+An old notice changes nothing: it applies to the content that it names alone. So neither a router nor a cache nor another client can invent, alter or repeat what matters. What may be withheld is
 found by asking.
 """
 
@@ -16,6 +15,7 @@ import secrets
 import time
 from dataclasses import dataclass, field
 from hashlib import sha256
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final, Literal
 
 from gnd.fleet_bus.errors import SealError
@@ -23,18 +23,26 @@ from gnd.fleet_bus.errors import SealError
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey, EllipticCurvePublicKey
 
-What = Literal["question", "answer", "refusal", "notice"]
-_WHAT: Final[dict[What, int]] = {"question": 1, "answer": 2, "refusal": 3, "notice": 4}
+What = Literal["question", "answer", "refusal", "notice", "number"]
+_WHAT: Final[dict[What, int]] = {"question": 1, "answer": 2, "refusal": 3, "notice": 4, "number": 5}
 _WHAT_OF: Final = {number: what for what, number in _WHAT.items()}
 
-MARK: Final = b"gS1"
+MARK: Final = b"\xa7"
 ID_BYTES: Final = 8
 SIGNATURE_BYTES: Final = 64
 NONCE_BYTES: Final = 8
 _TIME_BYTES: Final = 6
 _COUNT_WANTED: Final = 0x10
 _WITH_CHAIN: Final = 0x20
-_HEAD_BYTES: Final = len(MARK) + 1 + ID_BYTES + _TIME_BYTES
+_SIZES: Final[dict[What, tuple[int, int, int, int]]] = {
+    "question": (ID_BYTES, _TIME_BYTES, NONCE_BYTES, SIGNATURE_BYTES),
+    "answer": (ID_BYTES, 0, 0, SIGNATURE_BYTES),
+    "refusal": (ID_BYTES, 0, 0, SIGNATURE_BYTES),
+    "notice": (ID_BYTES, 0, 0, SIGNATURE_BYTES),
+    "number": (0, 0, NONCE_BYTES, 0),
+}
+"""Bytes of certificate id, time, nonce and signature. A "number" is what a question has that anybody may ask: nothing
+but what its answers are bound to."""
 MAX_CHAIN_BYTES: Final = 8192
 
 # Who may say what, by the third chunk of the key: `gnd/v1/<chunk>/…`.
@@ -75,7 +83,7 @@ class Seal:
     Attributes:
         what: kind of message that it belongs to.
         certificate_id: first 8 bytes of the SHA-256 of the signer's certificate (DER).
-        time_ms: when it was made, ms since 1970-01-01 UTC.
+        time_ms: of a signed question: when it was made, ms since 1970-01-01 UTC; else 0.
         signature: r and s, 32 bytes each.
         nonce: of a question, 8 bytes; else empty.
         count_wanted: of a question about a region: the number of answers is wanted at their end.
@@ -93,7 +101,7 @@ class Seal:
     def encode(self) -> bytes:
         """The attachment."""
         flags = _WHAT[self.what] | (_COUNT_WANTED if self.count_wanted else 0) | (_WITH_CHAIN if self.chain else 0)
-        time_ms = self.time_ms.to_bytes(_TIME_BYTES, "little")
+        time_ms = self.time_ms.to_bytes(_TIME_BYTES, "little") if _SIZES[self.what][1] else b""
         return MARK + bytes([flags]) + self.certificate_id + time_ms + self.nonce + self.signature + self.chain
 
     @classmethod
@@ -103,27 +111,19 @@ class Seal:
         Raises:
             SealError: it is no seal, or not whole.
         """
-        if not data.startswith(MARK) or len(data) < _HEAD_BYTES:
+        if not data.startswith(MARK) or len(data) < len(MARK) + 1:
             raise SealError("no seal")
         flags = data[len(MARK)]
         what = _WHAT_OF.get(flags & 0x0F)
-        nonce_bytes = NONCE_BYTES if what == "question" else 0
-        end = _HEAD_BYTES + nonce_bytes + SIGNATURE_BYTES
         if what is None or flags & ~(0x0F | _COUNT_WANTED | _WITH_CHAIN):
             raise SealError(f"a seal with flags {flags:#x} is not known")
-        chain = data[end:]
-        if len(data) < end or bool(chain) != bool(flags & _WITH_CHAIN) or len(chain) > MAX_CHAIN_BYTES:
-            raise SealError(f"a seal of {len(data)} bytes, {end} and at most {MAX_CHAIN_BYTES} more expected")
-        at = len(MARK) + 1
-        return cls(
-            what,
-            data[at : at + ID_BYTES],
-            int.from_bytes(data[at + ID_BYTES : _HEAD_BYTES], "little"),
-            data[end - SIGNATURE_BYTES : end],
-            data[_HEAD_BYTES : _HEAD_BYTES + nonce_bytes],
-            bool(flags & _COUNT_WANTED),
-            chain,
-        )
+        ends = list(accumulate(_SIZES[what], initial=len(MARK) + 1))
+        chain = data[ends[-1] :]
+        if len(data) < ends[-1] or bool(chain) != bool(flags & _WITH_CHAIN) or len(chain) > MAX_CHAIN_BYTES:
+            raise SealError(f"a seal of {len(data)} bytes, {ends[-1]} and at most {MAX_CHAIN_BYTES} more expected")
+        certificate_id, time_ms, nonce, signature = (data[begin:end] for begin, end in pairwise(ends))
+        count_wanted = bool(flags & _COUNT_WANTED)
+        return cls(what, certificate_id, int.from_bytes(time_ms, "little"), signature, nonce, count_wanted, chain)
 
     def signed_text(self, key: str, payload: bytes, question: bytes) -> bytes:
         """What is signed: everything but the chain, which proves itself."""
@@ -177,8 +177,11 @@ class Signer:
         self.chain = b"".join(len(one).to_bytes(2, "little") + one for one in chain)
 
     def question(self, key: str, payload: bytes, *, count_wanted: bool, with_chain: bool) -> Seal:
-        """The seal of a question."""
+        """The seal of a question; one that anybody may ask has a number alone."""
         nonce = secrets.token_bytes(NONCE_BYTES)
+        chunks = key.split("/", 3)
+        if len(chunks) > 2 and chunks[2] not in ASKED_BY:
+            return Seal("number", b"", 0, b"", nonce, count_wanted)
         return self._seal("question", key, payload, b"", nonce, count_wanted, self.chain if with_chain else b"")
 
     def answer(self, key: str, payload: bytes, question: bytes, *, refusal: bool = False) -> Seal:
@@ -202,7 +205,8 @@ class Signer:
         from cryptography.hazmat.primitives import hashes
         from cryptography.hazmat.primitives.asymmetric import ec, utils
 
-        blank = Seal(what, self.certificate_id, time.time_ns() // 1_000_000, b"", nonce, count_wanted, chain)
+        time_ms = time.time_ns() // 1_000_000 if what == "question" else 0
+        blank = Seal(what, self.certificate_id, time_ms, b"", nonce, count_wanted, chain)
         der = self._key.sign(blank.signed_text(key, payload, question), ec.ECDSA(hashes.SHA256()))
         r, s = utils.decode_dss_signature(der)
         signature = r.to_bytes(32, "big") + s.to_bytes(32, "big")

@@ -540,7 +540,7 @@ def test_attack_key_of_another_certificate(scene: Scene, tmp_path: Path) -> None
         scene.join(stolen)
 
 
-@pytest.mark.parametrize("size", [0, 1, 3, 12, 50, 81, 89])
+@pytest.mark.parametrize("size", [0, 1, 2, 10, 50, 81, 87])
 def test_attack_truncated_seal(scene: Scene, size: int) -> None:
     """A seal arrives truncated at any length; it is refused by name and nothing else happens."""
     shard = scene.shard.connection.sealing
