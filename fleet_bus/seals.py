@@ -3,12 +3,12 @@
 A seal is an attachment of zenoh: programs that do not know seals read the message as before. It is made with the key of
 the part's certificate (ECDSA on P-256, SHA-256), over the key expression, the payload, and
 
-- of a question: the time, and a number that is used once;
+- of a report, or another question that not everybody may ask: the time, and a number that is used once;
 - of an answer: the question that it answers, number included. So an answer cannot be kept and given again, and no clock
   is needed to know that it is new.
 
-An old notice changes nothing: it applies to the content that it names alone. So neither a router nor a cache nor another client can invent, alter or repeat what matters. What may be withheld is
-found by asking.
+An old notice changes nothing: it applies to the content that it names alone. So neither a router nor a cache nor
+another client can invent, alter or repeat what matters. What may be withheld is found by asking.
 """
 
 import secrets
