@@ -19,7 +19,7 @@ from typing import Final
 from gnd.cloud_merger.config import ShardConfig
 
 ENDS_IN_S: Final = 5.0
-NICER: Final = 10
+NICER: Final = 5
 """Acks and queries go first where the cores do not suffice for all."""
 _RESTART_S: Final = 1.0
 Address = tuple[str, int]
