@@ -53,6 +53,18 @@ def signals_as_before() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+@pytest.fixture(autouse=True)
+def identity_as_before() -> Iterator[None]:
+    """`--identity` of a command that a test calls in its own process is for the processes that it starts: not for the
+    next test.
+    """
+    before = os.environ.get("GND_IDENTITY")
+    yield
+    os.environ.pop("GND_IDENTITY", None)
+    if before is not None:
+        os.environ["GND_IDENTITY"] = before
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings; a test that needs it skips where it is missing."""

@@ -251,6 +251,7 @@ _KEYS = (
 _PARSERS = (
     keys.parse_tile_key, keys.parse_update_key, keys.parse_batch_key, keys.parse_catalog_key, keys.parse_change_key,
     keys.parse_traffic_key, keys.parse_state_key, keys.parse_alive_key, keys.parse_tiles_key,
+    keys.parse_health_key,
 )  # fmt: skip
 
 

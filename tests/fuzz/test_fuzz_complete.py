@@ -17,11 +17,13 @@ NAMED_LIKE_ONE = re.compile(r"(decode|read|load|parse|unpack|open|import)(d|ing|
 
 OPENS = "opens, reads or starts something of the running system: no bytes from outside come in by it"
 OWN_RUN = "reads what a run of this program has written into its own folder a moment before"
+OWN_FOLDER = "the part's own identity folder, read by the `cryptography` library; nobody else writes there"
 OF_TARGET = "takes what another target has read already"
 NOT_BYTES = "is named like a decoder and decodes nothing"
 BEHIND = "its tables and clouds go through readers that have targets, and `named_damage` stands around it"
 EXCEPTIONS = {
     "cloud_merger/reception.py:Reception.open": OPENS,
+    "cloud_merger/release/collector.py:HealthCollector.open": OPENS,
     "cloud_merger/states.py:States.open": OPENS,
     "cloud_merger/stored.py:decode_state": "a tile's codec and `TileMemory.decode`, both with targets",
     "cloud_merger/stored.py:Bases.decoded": "the codec of a stored tile, which has a target",
@@ -50,6 +52,11 @@ EXCEPTIONS = {
     "deploy/traffic_cli.py:load_links": "`load_link` of each name",
     "fleet_bus/bus.py:open_bus": OPENS,
     "fleet_bus/connection.py:Connection.open": OPENS,
+    "fleet_bus/gate.py:read_members": "`MemberList.decode` of a file of the own folder",
+    "fleet_bus/identity/folder.py:load_identity": OWN_FOLDER,
+    "fleet_bus/identity/folder.py:load_key": OWN_FOLDER,
+    "fleet_bus/seal_keys.py:load_authority": OWN_FOLDER,
+    "fleet_bus/seal_keys.py:load_signer": OWN_FOLDER,
     "fleet_bus/ledger_file.py:read_run": "`read_ledger` of each file",
     "fleet_bus/router.py:open_router": OPENS,
     "fleet_bus/wire.py:WireMeter.read": OPENS,
@@ -62,6 +69,8 @@ EXCEPTIONS = {
     "tile_store/feature_io/stored.py:import_features": OF_TARGET,
     "tile_store/feature_io/stored.py:load_features": "a store, which has a target",
     "tile_store/sqlite_roads.py:open_roads": OPENS,
+    "tile_store/sqlite_trials.py:open_trial": "a store, which has a target",
+    "tile_store/sqlite_trials.py:open_trials": "a store, which has a target",
     "tile_store/sqlite_store.py:SqliteStore.load": "a store, which has a target",
     "tile_store/store.py:Store.load": "an interface",
     "tile_store/values.py:StoredTile.decode_features": "codec 32, which has a target",
