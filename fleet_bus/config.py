@@ -33,7 +33,7 @@ QUEUED_BATCHES: Final = 16
 
 KIB: Final = 1024
 SIZES: Final = {
-    "gnd/v1/tile/**": 4 * KIB,
+    "gnd/v1/tile/**": 16 * KIB,
     "gnd/v1/tiles/**": 64 * KIB,
     "gnd/v1/catalog/**": 4 * KIB,
     "gnd/v1/state/**": 16 * KIB,

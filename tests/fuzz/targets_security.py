@@ -24,8 +24,8 @@ _TILE = TileId(497353963154)
 
 
 @cache
-def _authority() -> tuple[x509.Certificate, bytes]:
-    """A certificate that is its own authority, and its list of revoked ones."""
+def _authority() -> tuple[x509.Certificate, bytes, ec.EllipticCurvePrivateKey]:
+    """A certificate that is its own authority, its list of revoked ones, and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "vehicle.v-17")])
     builder = x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
@@ -33,7 +33,7 @@ def _authority() -> tuple[x509.Certificate, bytes]:
     certificate = builder.sign(key, hashes.SHA256())
     revoked = x509.CertificateRevocationListBuilder().issuer_name(name).last_update(_NOW)
     revoked = revoked.next_update(_NOW + dt.timedelta(days=1)).add_extension(x509.CRLNumber(1), critical=False)
-    return certificate, revoked.sign(key, hashes.SHA256()).public_bytes(Encoding.PEM)
+    return certificate, revoked.sign(key, hashes.SHA256()).public_bytes(Encoding.PEM), key
 
 
 def _chain() -> bytes:
@@ -64,7 +64,7 @@ TARGETS = (
         "seal", ("fleet_bus/seals.py:Seal.decode",), "seals (attachments)", Seal.decode, _seals, bytes_mutated
     ),
     FuzzTarget(
-        "certificate-chain", (), "certificates that a seal brings along (DER)", _holders, lambda: [_chain()], bytes_mutated
+        "certificate-chain", (), "certificates of a seal (DER)", _holders, lambda: [_chain()], bytes_mutated
     ),
     FuzzTarget(
         "revoked",
@@ -79,7 +79,7 @@ TARGETS = (
         ("fleet_bus/identity/lists.py:MemberList.decode",),
         "signed lists of members (JSON)",
         lambda data: MemberList.decode(data, [_authority()[0]]),
-        lambda: [b'{"list": "{\\"number\\": 1, \\"members\\": [], \\"revoked\\": []}", "signature": "AAAA"}'],
+        lambda: [MemberList(1, frozenset([MemberName("vehicle", "v-17")]), frozenset()).encode(_authority()[2])],
         text_mutated,
     ),
     FuzzTarget(
