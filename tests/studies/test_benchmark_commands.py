@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from studies.__main__ import NAMES, alone
 
-WITH_OPTIONS = {"poles": "--sensors"}
+WITH_OPTIONS = {"poles": "--sensors", "flooder": "--kinds"}
 
 
 @pytest.mark.parametrize("name", NAMES)
