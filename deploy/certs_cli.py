@@ -77,6 +77,55 @@ for _role in ROLES:
     certs.add_command(_issuing(_role))
 
 
+@certs.command(short_help="Issue a vehicle's pseudonyms.")
+@click.argument("name")
+@_AUTHORITY
+@click.option("--out", type=PATH, help="Folder of pseudonyms.  [default: pseudonyms.NAME]")
+@click.option("--count", type=int, default=7, show_default=True, help="For so many periods, the present one included.")
+@click.option("--hours", type=float, default=24.0, show_default=True, help="Length of a period; of all vehicles alike.")
+@click.option("--owner", default="", help="Organisation, for all to read: it links vehicles of a small owner.")
+@_TO
+@_CONNECT
+@_IDENTITY
+def pseudonyms(name: str, authority: Path, out: Path | None, owner: str, **options: Any) -> None:
+    """Issue the vehicle NAME an identity for each day, under names that tell nobody but the authority whose they are.
+
+    What the folder holds already stays. `gnd agent --identity FOLDER` takes the present one for each trip.
+    """
+    from gnd.fleet_bus.identity.authority import Authority
+    from gnd.fleet_bus.identity.pseudonyms import issue_pseudonyms
+
+    opened, folder = Authority(authority), out or Path(f"pseudonyms.{name}")
+    count, hours = options.pop("count"), options.pop("hours")
+    issued = issue_pseudonyms(opened, name, folder, count=count, hours=hours, owner=owner)
+    last = f", the last until {issued[-1].ends}" if issued else ""
+    click.echo(f"{len(issued)} of {count} pseudonyms of {name} are new in {folder}{last}")
+    _publish(opened, **options)
+
+
+@certs.command(short_help="Whose a pseudonym is.")
+@click.argument("names", nargs=-1, required=True)
+@_AUTHORITY
+@click.option("--all", "every", is_flag=True, help="NAMES are vehicles: list all pseudonyms of each.")
+@click.option("--json", "as_json", is_flag=True, help="As JSON.")
+def whose(names: tuple[str, ...], authority: Path, every: bool, as_json: bool) -> None:
+    """Say which vehicle is behind each pseudonym: only the authority's key can."""
+    from gnd.fleet_bus.identity.authority import Authority
+    from gnd.fleet_bus.identity.pseudonyms import pseudonyms_of
+    from gnd.fleet_bus.identity.pseudonyms import whose as holder_of
+
+    opened = Authority(authority)
+    if every:
+        pairs = [(entry.name, name) for name in names for entry in pseudonyms_of(opened, name)]
+    else:
+        pairs = [(name, holder_of(opened, name)) for name in names]
+    if as_json:
+        click.echo(json.dumps(dict(pairs), indent=2))
+        return
+    for pseudonym, holder in pairs:
+        click.echo(f"{pseudonym}  {holder}")
+
+
 @certs.command(short_help="Shut a member out.")
 @click.argument("member")
 @_AUTHORITY
@@ -84,12 +133,19 @@ for _role in ROLES:
 @_CONNECT
 @_IDENTITY
 def revoke(member: str, authority: Path, **options: Any) -> None:
-    """Take back every certificate of MEMBER, such as vehicle.v-17, and tell routers: they cut it off within seconds."""
+    """Take back every certificate of MEMBER, such as vehicle.v-17, and tell routers: they cut it off within seconds.
+
+    Of a vehicle all its pseudonyms are taken back, too.
+    """
     from gnd.fleet_bus.identity.authority import Authority
+    from gnd.fleet_bus.identity.pseudonyms import with_pseudonyms
 
     opened = Authority(authority)
-    for entry in opened.revoke(MemberName.parse(member)):
-        click.echo(f"{member}: certificate {entry.serial} is revoked; it would have held until {entry.ends}")
+    for one in with_pseudonyms(opened, MemberName.parse(member)):
+        for entry in opened.revoke(one):
+            click.echo(
+                f"{one.common_name}: certificate {entry.serial} is revoked; it would have held until {entry.ends}"
+            )
     _publish(opened, **options)
 
 

@@ -109,7 +109,7 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
     driven_m = max(sample.odometer_m, 1000 * traffic.drive_km if traffic else 0.0)
     return (
         sample.vehicle,
-        f"{math.degrees(sample.lat_rad):.5f} {math.degrees(sample.lon_rad):.5f}",
+        f"{math.degrees(sample.lat_rad):.5f} {math.degrees(sample.lon_rad):.5f}" if sample.has_position else "private",
         Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
         f"{driven_m:.0f} m",
         renewed_text(state.maps.get(sample.vehicle)),

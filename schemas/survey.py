@@ -236,6 +236,15 @@ def check_survey_bytes(data: bytes) -> None:
         check_field_count("SurveyReport", survey, _MAX_FIELDS)
 
 
+def is_survey(data: bytes) -> bool:
+    """Whether a message holds a part of a survey; it is not read.
+
+    Raises:
+        Malformed: the bytes are not fields.
+    """
+    return any(True for _ in submessages("ChangeReport", data, _NUMBER))
+
+
 def survey_of(message: survey_report_pb2.SurveyReport) -> SurveyReport:
     """The checked part of a parsed message; `SchemaError` when it is none."""
     with refusing("SurveyReport"):

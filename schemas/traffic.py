@@ -25,6 +25,8 @@ from gnd.schemas.wire import (
 
 Direction = Literal["up", "down"]
 _DIRECTION: Final[dict[int, Direction]] = {1: "up", 2: "down"}
+NO_POSITION: Final = (0.0, 0.0)
+"""Latitude and longitude of a sample that does not tell where the vehicle is."""
 _MAX_LINES: Final = 64
 _MAX_REASONS: Final = 32
 
@@ -92,6 +94,11 @@ class TrafficSample:
             check_unsigned("tiles by reason of doubt", tiles, bits=32)
         self._check_position()
         self._check_lines()
+
+    @property
+    def has_position(self) -> bool:
+        """Whether the vehicle tells where it is."""
+        return (self.lat_rad, self.lon_rad) != NO_POSITION
 
     @property
     def doubts_in_words(self) -> dict[str, int]:

@@ -3,15 +3,20 @@
 import logging
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
+from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import settings_text
+
+if TYPE_CHECKING:
+    from gnd.vehicle_agent.config import AgentConfig
 
 
 @click.command()
@@ -69,7 +74,7 @@ def agent(
         "detect": {"mode": mode},
         "features": {"layers": None if layers is None else feature_layers(layers)},
     }
-    config = load_agent(config_file, changes, options)
+    config = _under_pseudonym(load_agent(config_file, changes, options))
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return
@@ -82,6 +87,28 @@ def agent(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     click.echo(summary_line(run_agent(config, stop)))
+
+
+def _under_pseudonym(config: "AgentConfig") -> "AgentConfig":
+    """The settings with the vehicle's present name, where its identity is a folder of pseudonyms."""
+    if identity_of_environment() is None:
+        return config
+    from gnd.fleet_bus.identity.pseudonyms import take_pseudonym
+    from gnd.vehicle_agent.config import DEFAULT_NAME, PRIVATE_M
+    from gnd.vehicle_agent.errors import AgentConfigError
+
+    taken = take_pseudonym()
+    if taken is None:
+        return config
+    name, folder = taken
+    if config.vehicle != DEFAULT_NAME:
+        raise AgentConfigError(
+            f"vehicle = {config.vehicle}: with a folder of pseudonyms the name is the present one, {name}"
+        )
+    report = replace(config.report, private_m=config.report.private_m or PRIVATE_M)
+    is_default = config.work_dir == Path("runs", config.vehicle)
+    work_dir = Path("runs", folder.resolve().name) if is_default else config.work_dir
+    return replace(config, vehicle=name, pseudonyms=folder, report=report, work_dir=work_dir)
 
 
 def feature_layers(layers: str) -> list[str]:

@@ -23,6 +23,14 @@ LocaliseBy = Literal["lidar", "slamcu", "graph"]
 LEAD_S: Final = 6.0
 """A question is sent when something is needed within this time; with it goes all that is ahead."""
 
+DEFAULT_NAME: Final = "vehicle"
+PRIVATE_M: Final = 300.0
+"""Radius of the private places of a vehicle with pseudonyms that sets none."""
+PRIVATE_OFF: Final = 0.75
+"""Begins and ends within this share of a private place's radius from its centre belong to it."""
+PRIVATE_SEEN_M: Final = 60.0
+"""A tile so far outside of a private place is not told of, either: the vehicle has seen it from inside."""
+
 
 @dataclass(frozen=True, slots=True)
 class DownloadParameters:
@@ -90,6 +98,14 @@ class ReportParameters:
     max_sigma_rad: float = setting(
         0.02, "The same for the attitude: about its worst axis, 40 cm at 20 m.", unit="rad", above=0
     )
+    private_m: float = setting(
+        0.0,
+        "Nothing is told of places nearer than this to where a trip begins and ends, of its position, and of its begin"
+        " to the second; 0: all is told. A vehicle with pseudonyms that sets none keeps 300 m.",
+        unit="m",
+        least=0,
+        most=20_000,
+    )
     check_poses: bool = setting(
         True, "Scans are evidence only once no small shift lays them better onto the map; off only for studies."
     )
@@ -99,6 +115,11 @@ class ReportParameters:
         unit="s",
         least=0,
     )
+
+    @property
+    def hold_m(self) -> float:
+        """What lies nearer than this could lie in the private place where the trip ends; 0: nothing is private."""
+        return (1 + PRIVATE_OFF) * self.private_m + PRIVATE_SEEN_M if self.private_m else 0.0
 
     def __post_init__(self) -> None:
         """A protocol that there is, and waiting times in order."""
@@ -152,8 +173,9 @@ class PipelineParameters:
 class AgentConfig:
     """One vehicle agent.
 
-    The ledger goes to `ledger_dir`, by default the folder `ledger` beside `work_dir`. `departure`: where several
-    vehicles drive in one world, when this one starts, and the clock that they share; no setting.
+    The ledger goes to `ledger_dir`, by default the folder `ledger` beside `work_dir`. Two are no settings: `departure`,
+    where several vehicles drive in one world, when this one starts, and the clock that they share; and `pseudonyms`,
+    the folder that the vehicle's present name comes from, None where it always has the same.
     """
 
     vehicle: str = setting(..., "Pseudonym of the vehicle.")
@@ -172,6 +194,7 @@ class AgentConfig:
         least=0,
     )
     departure: Departure | None = None
+    pseudonyms: Path | None = None
     ledger_dir: Path | None = setting(None, "Folder of the traffic ledger; by default `ledger` beside `work_dir`.")
     live: LiveParameters = setting(LiveParameters, "Topics of a vehicle that drives now.")
     localise: LocaliserParameters = setting(LocaliserParameters, "Localisation.")
@@ -204,6 +227,11 @@ class AgentConfig:
             raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are {', '.join(get_args(LocaliseBy))}")
         if self.localise_by != "lidar" and not self.features.layers:
             raise AgentConfigError("a vehicle without LiDAR maps features: name at least one feature layer")
+
+    @property
+    def private_file(self) -> Path:
+        """Where the vehicle remembers its private places."""
+        return (self.pseudonyms or self.work_dir) / "private_places.json"
 
     @property
     def ledger_path(self) -> Path:

@@ -8,7 +8,7 @@ from gnd.fleet_bus.settings_file import layers_of
 from gnd.gnd_map.config import to_mapping
 from gnd.gnd_map.settings import from_settings, merged, plain_settings
 from gnd.schemas.feature_layer import declared_layers, named_layer
-from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.config import DEFAULT_NAME, AgentConfig
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 
 
@@ -45,7 +45,7 @@ def agent_of(given: Mapping[str, Any], *, where: str = "agent") -> AgentConfig:
         ConfigError: as of `load_agent`.
         LayerError: a layer that nobody has declared.
     """
-    values = merged({"vehicle": "vehicle", "drive": None}, _defaults_of_mode(given), given)
+    values = merged({"vehicle": DEFAULT_NAME, "drive": None}, _defaults_of_mode(given), given)
     values.setdefault("work_dir", f"runs/{values['vehicle']}")
     features = values.get("features")
     if isinstance(features, Mapping) and isinstance(layers := features.get("layers"), list | tuple):

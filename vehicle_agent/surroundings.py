@@ -4,6 +4,7 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -180,6 +181,30 @@ def tile_distance_m(frame: LocalFrame, tile_id: TileId, p_map_m: F64) -> float:
     corners = frame.enu_from_geodetic(np.array([south, north]), np.array([west, east]), np.zeros(2))[:, :2]
     outside = np.maximum(0.0, np.maximum(corners[0] - p_map_m[:2], p_map_m[:2] - corners[1]))
     return float(np.hypot(*outside))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileRectangles:
+    """Tiles as rectangles of the map frame, for many distances to the same ones.
+
+    Attributes:
+        low_m, high_m: (N, 2) corners.
+    """
+
+    low_m: F64
+    high_m: F64
+
+    @classmethod
+    def of(cls, frame: LocalFrame, tiles: Iterable[TileId]) -> "TileRectangles":
+        """Where tiles lie in a frame."""
+        corners = np.array([(one.south_west_rad, one.north_east_rad) for one in tiles]).reshape(-1, 2)
+        enu_m = frame.enu_from_geodetic(corners[:, 0], corners[:, 1], np.zeros(len(corners)))[:, :2]
+        return cls(enu_m[0::2], enu_m[1::2])
+
+    def distances_m(self, p_map_m: F64) -> F64:
+        """(N,) horizontal distances of a point (3,), 0 inside: `tile_distance_m` of each."""
+        outside = np.maximum(0.0, np.maximum(self.low_m - p_map_m[:2], p_map_m[:2] - self.high_m))
+        return np.asarray(np.hypot(outside[:, 0], outside[:, 1]))
 
 
 def left_behind(frame: LocalFrame, tiles: Iterable[TileId], p_map_m: F64, distance_m: float) -> tuple[TileId, ...]:

@@ -13,10 +13,11 @@ from gnd.schemas.doubt import tiles_by_reason
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.health import HealthReport
-from gnd.schemas.traffic import TrafficLine, TrafficSample
+from gnd.schemas.traffic import NO_POSITION, TrafficLine, TrafficSample
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.link.feature_tiles_on_the_bus import FeatureTilesOnTheBus, open_feature_tiles
 from gnd.vehicle_agent.link.link import Link, open_link
+from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.link.telemetry import Telemetry
 from gnd.vehicle_agent.link.tiles_on_the_bus import TilesOnTheBus
 from gnd.vehicle_agent.link.trial_telemetry import TrialTelemetry
@@ -25,6 +26,7 @@ from gnd.vehicle_agent.localise.estimates import RefinedScan
 from gnd.vehicle_agent.memory import MemoryMeter
 from gnd.vehicle_agent.pipeline import Output, Parts, Pipeline, VehiclePipeline
 from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.private_places import Circles, PrivatePlaces
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.result import PoseEvaluation
 from gnd.vehicle_agent.sources.live import LiveError
@@ -50,6 +52,8 @@ class OnTheBus:
     """Update notices of the voxel map, by what became of them."""
     trials: TrialTelemetry | None = None
     """What is told of tiles on trial; None: a vehicle that does not match scans with the voxel map."""
+    places: PrivatePlaces | None = None
+    """Where the vehicle says nothing; None: it has no private places."""
 
     def tiles(self, local_map: LocalMap, touched: Touched) -> TilesOnTheBus:
         """Make what fills a local map."""
@@ -66,7 +70,8 @@ class OnTheBus:
 
     def health_reports(self, *, all_of_it: bool = False) -> list[HealthReport]:
         """What there is to tell of tiles on trial."""
-        return [] if self.trials is None else self.trials.due(all_of_it=all_of_it)
+        told = [] if self.trials is None else self.trials.due(all_of_it=all_of_it)
+        return told if self.places is None else self.places.say(told)
 
 
 @dataclass(slots=True)
@@ -114,10 +119,14 @@ class AgentVehicle:
             self.bus.trials.note(self.pipeline.place)
         self.show(output, self.pipeline.place)
         self.way.note(self.pipeline.place)
+        if self.bus.places is not None:
+            self.bus.places.move(self.pipeline.place)
         self.link.ledger.set_position(self.pipeline.place.odometer_m, item.t_ns)
 
     def finish(self) -> None:
         """The drive has ended: what waits is judged, decided and reported."""
+        if self.bus.places is not None:
+            self.bus.places.end()
         output = self.pipeline.finish()
         self.evaluation.estimates += output.poses
         self.show(output, self.pipeline.place)
@@ -134,7 +143,7 @@ class AgentVehicle:
     def sample(self) -> TrafficSample:
         """The ledger's totals, position and health, for the bus."""
         place, held_back = self.pipeline.place, self.pipeline.held_back
-        lat, lon = place.geodetic
+        lat, lon = place.geodetic if self.bus.places is None else NO_POSITION
         wire = self.link.bus.wire()
         lines = (TrafficLine(x.kind, x.direction, x.messages, x.app_bytes) for x in self.link.ledger.totals())
         return TrafficSample(
@@ -171,6 +180,7 @@ class AgentVehicle:
             "live": self.source.account(),
             "localisation": self.evaluation.errors(),
             "memory_mb": self.memory.read(),
+            "private": {} if self.bus.places is None else dict(self.bus.places.counts),
         }
 
     def _link_counts(self) -> dict[str, Any]:
@@ -206,7 +216,7 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[AgentVe
         open_link(config) as link,
         open_feature_tiles(config, link, stop) as feature_tiles,
     ):
-        bus = OnTheBus(config, link, feature_tiles, stop)
+        bus = OnTheBus(config, link, feature_tiles, stop, places=_private_places(config, source.fix, link.outbox))
         pipeline = _pipeline(source.header, source.fix, bus)
         evaluation = PoseEvaluation.between(pipeline.place.frame, source.header.anchor)
         with Way(config.work_dir / WAY_FILE, pipeline.tile) as way:
@@ -222,26 +232,34 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[AgentVe
                 telemetry.close()
 
 
+def _private_places(config: AgentConfig, fix: GnssFix, outbox: Outbox) -> PrivatePlaces | None:
+    """What stands between the reports and the outbox where a vehicle has private places."""
+    if not config.report.private_m:
+        return None
+    return PrivatePlaces(Circles(config.private_file, config.report.private_m), config.report.hold_m, fix, outbox)
+
+
 def _pipeline(header: DriveHeader, fix: GnssFix, bus: OnTheBus) -> VehiclePipeline:
     """What the configured kind of vehicle is fed to; one without LiDAR does not load the parts of one with it."""
     config, link, features = bus.config, bus.link, bus.features
-    identity = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)
+    private, outbox = bus.places is not None, bus.places or link.outbox
+    identity = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer, is_private=private)
     if config.localise_by == "slamcu":
         from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
 
         signs = replace(identity, layer=config.features.layers[0].name)
-        return CameraPipeline(fix, config.pipeline, signs, link.outbox, features)
+        return CameraPipeline(fix, config.pipeline, signs, outbox, features)
     if config.localise_by == "graph":
         from gnd.vehicle_agent.features.mapping.graph_pipeline import GraphPipeline
 
-        return GraphPipeline(fix, config.pipeline, identity, link.outbox, features)
+        return GraphPipeline(fix, config.pipeline, identity, outbox, features)
     return Pipeline(
         header,
         fix,
         bus.tiles,
         config.pipeline,
         identity=identity,
-        outbox=link.outbox,
+        outbox=outbox,
         feature_tiles=features,
         parts=Parts(placed=(bus.see,)),
     )

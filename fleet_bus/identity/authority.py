@@ -46,6 +46,7 @@ class RegisterEntry:
         begins: first second, ISO 8601 UTC.
         ends: last second, ISO 8601 UTC.
         revoked: when it was taken back, ISO 8601 UTC; "" = it was not.
+        holder: of a pseudonym: whose it is, encrypted (`pseudonyms`).
     """
 
     serial: str
@@ -55,6 +56,7 @@ class RegisterEntry:
     begins: str
     ends: str
     revoked: str = ""
+    holder: str = ""
 
     @property
     def member(self) -> MemberName:
@@ -82,6 +84,11 @@ class Authority:
         except (OSError, ValueError) as error:
             raise IdentityError(f"{folder}: no authority ({error}); `gnd certs init` makes one") from error
         self._entries = {entry.serial: entry for entry in _read_register(folder / REGISTER)}
+
+    @property
+    def key(self) -> ec.EllipticCurvePrivateKey:
+        """Private key of the root."""
+        return self._key
 
     @classmethod
     def create(cls, folder: Path, name: str) -> Self:
@@ -114,6 +121,8 @@ class Authority:
         hosts: Sequence[str] = (),
         days: float = 0.0,
         begins: dt.datetime | None = None,
+        ends: dt.datetime | None = None,
+        holder: str = "",
     ) -> RegisterEntry:
         """Makes a key and a certificate for a member, and writes its identity folder.
 
@@ -124,6 +133,8 @@ class Authority:
             hosts: names and addresses under which a router is reached.
             days: how long it holds; 0 = `VEHICLE_DAYS` for a vehicle, else `SERVER_DAYS`.
             begins: first moment; None = five minutes ago.
+            ends: last moment, instead of `days`.
+            holder: of a pseudonym, as the register keeps it.
 
         Raises:
             IdentityError: the name is shut out, because a certificate of it was revoked and has not ended; or `out`
@@ -133,7 +144,7 @@ class Authority:
         self._check_name(member, out, now)
         days = days or (VEHICLE_DAYS if member.role == "vehicle" else SERVER_DAYS)
         key, begins = ec.generate_private_key(ec.SECP256R1()), begins or now - _EARLIER
-        certificate = self._certificate(member, owner, hosts, key, begins, now + dt.timedelta(days=days))
+        certificate = self._certificate(member, owner, hosts, key, begins, ends or now + dt.timedelta(days=days))
         entry = RegisterEntry(
             f"{certificate.serial_number:x}",
             member.role,
@@ -141,6 +152,7 @@ class Authority:
             owner,
             certificate.not_valid_before_utc.isoformat(),
             certificate.not_valid_after_utc.isoformat(),
+            holder=holder,
         )
         self._record(entry)  # before it can be used
         out.mkdir(parents=True, exist_ok=True, mode=0o700)

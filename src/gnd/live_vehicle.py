@@ -274,3 +274,6 @@ class _Passed:
 
     def body_of(self, _report_id: str) -> bytes | None:
         return None
+
+    def hides(self, _tile: TileId) -> bool:
+        return False

@@ -118,6 +118,7 @@ def test_a_notice_of_an_owner_that_lives_but_does_not_announce_is_sent_by_anothe
 
 
 def test_the_leases_of_a_shard_that_has_gone_are_freed_at_once(cloud, shard):
+    cloud.store.join("ghost")
     ghost = cloud.bus.declare_alive(alive_key("merger", "ghost"))
     report = report_of(1, change_of(BASE, [0, 1, 2], {2: POLE}))
     cloud.store.put_reports([ReportRow(report.report_id, "ndt", TILE, "car", 0, report.encode())])

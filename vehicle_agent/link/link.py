@@ -52,6 +52,8 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
         OutboxError, CacheError: a file cannot be opened.
     """
     outbox = Outbox(config.work_dir / "outbox.sqlite")
+    if config.pseudonyms is not None and (n := outbox.forget_others(config.vehicle)):
+        _log.warning("%s: %d reports of an earlier name are not sent: they would link the two", config.vehicle, n)
     cache: TileCache[Tile] = TileCache(config.work_dir / "cache.sqlite", config.layer)
     ledger = Ledger(config.vehicle, config.ledger_path)
     bus = open_bus(BusConfig(connect=config.connect, link=config.link, patient=True), ledger, config.vehicle)

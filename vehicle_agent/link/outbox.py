@@ -22,6 +22,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile, content_sha
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.report_states import ReportState
+from gnd.schemas.upload_head import head_of_upload
 from gnd.vehicle_agent.errors import OutboxError
 from gnd.vehicle_agent.link.sqlite import Database
 
@@ -77,6 +78,7 @@ _FORGET = (
     " AND NOT EXISTS (SELECT 1 FROM needs WHERE needs.sha = base.sha AND needs.report_id <> ?1)",
     "DELETE FROM needs WHERE report_id = ?",
 )
+_UNPACK = "DELETE FROM packed WHERE report_id = ?"
 _CODECS = (CODEC_STANDARD_ZSTD, CODEC_FLOAT32_ZSTD)  # quick, and the second can say anything
 ANSWERS = ("stored", "duplicate", "quarantined")
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 15.0
@@ -280,6 +282,20 @@ class Outbox:
         rows = self._db.run("SELECT body FROM report WHERE report_id = ?", (report_id,))
         return bytes(rows[0][0]) if rows else None
 
+    def hides(self, _tile: TileId) -> bool:
+        """Nothing is private."""
+        return False
+
+    def forget_others(self, vehicle: str) -> int:
+        """Remove what was made under another name, which nobody is to learn; how many reports they were."""
+        rows = self._db.run("SELECT report_id, body FROM report")
+        others = [report_id for report_id, body in rows if head_of_upload(bytes(body)).vehicle != vehicle]
+        with self._db.transaction() as c:
+            for report_id in others:
+                for sql in (_UNPACK, *_FORGET, "DELETE FROM report WHERE report_id = ?"):
+                    c.execute(sql, (report_id,))
+        return len(others)
+
     def refused(self) -> list[tuple[str, str]]:
         """(report id, reason) of the quarantined reports."""
         rows = self._db.run("SELECT report_id, reason FROM report WHERE state = 'quarantined' ORDER BY report_id")
@@ -323,7 +339,7 @@ def _hear_of_held(c: apsw.Connection, state: ReportState, now_ns: int) -> None:
 
 
 def _whole(c: apsw.Connection, report_id: str, reason: str) -> None:
-    for sql in ("DELETE FROM packed WHERE report_id = ?", *_FORGET):
+    for sql in (_UNPACK, *_FORGET):
         c.execute(sql, (report_id,))
     sql = "UPDATE report SET state = 'pending', wanted = x'', attempts = 0, next_ns = 0, reason = ? WHERE report_id = ?"
     c.execute(sql, (reason, report_id))

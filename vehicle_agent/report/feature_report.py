@@ -64,7 +64,11 @@ class FeatureReporter:
             self._report(district, t_ns)
 
     def _report(self, district: District, t_ns: int) -> None:
-        report = self._make(district, self._pending.pop(district), t_ns)
+        pending = self._pending.pop(district)
+        pending.changes = {tile: one for tile, one in pending.changes.items() if not self._outbox.hides(tile)}
+        if not pending.changes:
+            return
+        report = self._make(district, pending, t_ns)
         self._numbers[district] += 1
         if self._outbox.put(report.report_id, change_key(report.layer, district), report.encode()):
             self.counts["reports"] += 1
@@ -78,7 +82,7 @@ class FeatureReporter:
         who, number = self._who, str(self._numbers[district])
         parts = who.vehicle, who.drive_id, who.layer, district.path, number
         return FeatureReport(
-            report_id=deterministic_report_id(self._start_ns // 1_000_000, *parts),
+            report_id=deterministic_report_id(who.begun_ns(self._start_ns) // 1_000_000, *parts),
             vehicle=who.vehicle,
             sensor_model=who.sensor_model,
             software=who.software,

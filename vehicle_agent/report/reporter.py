@@ -56,6 +56,7 @@ the LiDAR stands from the vehicle's origin, and what the vehicle drives during a
 SOON_VOXELS: Final = 48
 """Where so many voxels of one tile have changed, a report is due at once. On ground that has not changed, detection
 errs in up to some 30."""
+_HOUR_NS: Final = 3_600_000_000_000
 _SOON_S: Final = 0.3
 """Such a report waits this long for tiles that are left together with the first ..."""
 APART_S: Final = 3.0
@@ -73,6 +74,12 @@ class Identity:
     sensor_model: str
     layer: str
     software: str = field(default_factory=lambda: f"gnd-fleet {version('gnd-fleet')}")
+    is_private: bool = False
+    """The begin of the trip is told to the hour before."""
+
+    def begun_ns(self, t_ns: int) -> int:
+        """The begin of the trip (ns) as it is told, in report ids and as the time of the first scan."""
+        return t_ns - t_ns % _HOUR_NS if self.is_private else t_ns
 
 
 @dataclass(slots=True)
@@ -181,7 +188,7 @@ class Reporter:
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
         self._match_map = MatchMapCache(detector.local_map, RegistrationParameters().noise_m)
         self._trial = Trial(self._match_map)
-        self._left_behind_m = detector.parameters.range_max_m + _LEAVE_M
+        self._left_behind_m = max(detector.parameters.range_max_m + _LEAVE_M, parameters.hold_m)
         self._doubts = TileDoubts(detector.local_map.grid_frame)
         self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
         self._shifted = 0
@@ -364,6 +371,7 @@ class Reporter:
 
     def _put(self, district: District, tiles: Set[TileId], pending: _PendingTiles, *, whole: bool) -> None:
         """Report these of the pending tiles; those that an earlier life of this agent has stated stand as they are."""
+        tiles = {tile for tile in tiles if not self._outbox.hides(tile)}
         while tiles := self._unstated(tiles):
             report = self._make(district, [pending.changes[t] for t in sorted(tiles)])
             self._numbers[district] += 1
@@ -405,16 +413,15 @@ class Reporter:
     def _make(self, district: District, changes: list[TileChange]) -> ChangeReport:
         stretch = self._stretch or _Stretch(self._start_ns, self._start_ns)
         who, number = self._who, str(self._numbers[district])
-        report_id = deterministic_report_id(
-            self._start_ns // 1_000_000, who.vehicle, who.drive_id, who.layer, district.path, number
-        )
+        begun_ms = who.begun_ns(self._start_ns) // 1_000_000
+        report_id = deterministic_report_id(begun_ms, who.vehicle, who.drive_id, who.layer, district.path, number)
         return ChangeReport(
             report_id=report_id,
             vehicle=who.vehicle,
             sensor_model=who.sensor_model,
             software=who.software,
             district=district,
-            first_ns=stretch.first_ns,
+            first_ns=who.begun_ns(stretch.first_ns),
             last_ns=stretch.last_ns,
             tiles=tuple(changes),
             layer=who.layer,

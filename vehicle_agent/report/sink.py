@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,9 @@ class ReportSink(Protocol):
     def body_of(self, report_id: str) -> bytes | None:
         """The body that is kept under an id, None without one."""
 
+    def hides(self, tile: TileId) -> bool:
+        """Whether nothing is to be told of a tile: a report that names it would not be passed on."""
+
 
 class ReportList:
     """Keeps reports in memory, in the order in which they came."""
@@ -53,6 +57,10 @@ class ReportList:
         """The body that is kept under an id, None without one."""
         known = self._kept.get(report_id)
         return None if known is None else known.body
+
+    def hides(self, _tile: TileId) -> bool:
+        """Nothing is private."""
+        return False
 
     @property
     def reports(self) -> tuple[OutgoingReport, ...]:
@@ -78,6 +86,10 @@ class NewReports:
     def body_of(self, report_id: str) -> bytes | None:
         """The body that the sink keeps under an id, None without one."""
         return self._sink.body_of(report_id)
+
+    def hides(self, tile: TileId) -> bool:
+        """Whether the sink will tell nothing of a tile."""
+        return self._sink.hides(tile)
 
     def take(self) -> tuple[OutgoingReport, ...]:
         """What was put in since this was called last."""

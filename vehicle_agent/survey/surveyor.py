@@ -205,7 +205,7 @@ class Surveyor:
     def _put(self, survey: _Survey, some: list[ClosedSubmap], *, is_last: bool) -> None:
         who = self._who
         names = who.vehicle, who.drive_id, who.layer, "survey", str(survey.number), str(survey.parts)
-        report_id = deterministic_report_id(survey.start_ns // 1_000_000, *names)
+        report_id = deterministic_report_id(who.begun_ns(survey.start_ns) // 1_000_000, *names)
         survey.survey_id = survey.survey_id or report_id
         report = SurveyReport(
             report_id=report_id,
