@@ -16,6 +16,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
+from zlib import crc32
 
 import numpy as np
 import zstandard
@@ -175,6 +176,11 @@ class TileMemory:
             return cls(voxels, claims, tuple(Witness(**one) for one in head["witnesses"]), head["voters"], parked)
         except (ValueError, KeyError, TypeError) as error:
             raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
+
+
+def mark_of(vehicle: str) -> np.uint16:
+    """What `last` remembers of a vehicle."""
+    return np.uint16(crc32(vehicle.encode()) & 0xFFFF)
 
 
 def _told(witness: Witness) -> dict[str, Any]:

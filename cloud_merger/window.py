@@ -7,7 +7,6 @@ of shards end in the same map, bit for bit, and `gnd.cloud_merger.verify` comput
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from gnd.cloud_merger.memory import (
     VOXEL,
     ParkedVoxels,
     TileMemory,
+    mark_of,
 )
 from gnd.cloud_merger.merge import MergedTile, MergeParameters, merge_tile
 from gnd.cloud_merger.parked import hold_parked, parked_after
@@ -229,7 +229,7 @@ def _observed(memory: TileMemory, window: MergedWindow, changed: I32, agrees: ND
     observers = found["observers"].astype(np.int64)
     for one, ids in sorted(_by_vehicle(reports, confirmed), key=lambda pair: pair[0].turn):
         at = table.at(ids)
-        mark = np.uint16(crc32(one.vehicle.encode()) & 0xFFFF)
+        mark = mark_of(one.vehicle)
         is_new = (found["last"][at] != mark) | (observers[at] == 0)
         if not memory.is_fresh(one):
             is_new &= observers[at] == 0  # its vote of half an hour ago

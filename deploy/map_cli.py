@@ -8,6 +8,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from gnd.deploy.erase_cli import erase
 from gnd.deploy.map_export.command import diff, export
 from gnd.deploy.map_export.serve import serve
 from gnd.deploy.tile_memory_cli import memory
@@ -118,9 +119,16 @@ def _bars() -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
 
 
-_COMMANDS = {**store_group.commands, "rollback": rollback, "export": export, "serve": serve, "diff": diff}
+_COMMANDS = {
+    **store_group.commands,
+    "rollback": rollback,
+    "erase": erase,
+    "export": export,
+    "serve": serve,
+    "diff": diff,
+}
 map_group = click.Group(
     "map",
     commands=[build, align, verify, memory, *_COMMANDS.values()],
-    help="Build, align, inspect, compare, export, serve, verify and roll back maps.",
+    help="Build, align, inspect, compare, export, serve, verify, roll back and erase.",
 )

@@ -1168,3 +1168,134 @@ SELECT at_ns, who, action, version, why FROM trial_steered WHERE layer = :layer 
 -- name: rows_of_report
 SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
 WHERE layer = :layer AND tile = :tile AND report_id = :report_id ORDER BY part
+
+-- name: is_counted_out
+SELECT 1 FROM quarantined_vehicle WHERE vehicle = :vehicle UNION ALL SELECT 1 FROM shifted_vehicle WHERE vehicle = :vehicle
+
+-- name: count_out_too
+INSERT INTO quarantined_vehicle (vehicle, since_ns, source, why)
+SELECT :name, since_ns, 'operator', :why FROM quarantined_vehicle WHERE vehicle = :vehicle
+
+-- name: shift_too
+INSERT INTO shifted_vehicle (vehicle, since_ns) SELECT :name, since_ns FROM shifted_vehicle WHERE vehicle = :vehicle
+
+-- name: tiles_to_erase
+SELECT DISTINCT layer, tile FROM report WHERE vehicle = :vehicle ORDER BY layer, tile
+
+-- name: rows_to_erase
+SELECT arrival, report_id, received_ns, body, base_sha, part, window, seq FROM report
+WHERE layer = :layer AND tile = :tile AND vehicle = :vehicle ORDER BY arrival
+
+-- name: report_ids_of_tile
+SELECT DISTINCT report_id FROM report WHERE layer = :layer AND tile = :tile
+
+-- name: provenances_of_tile
+SELECT version, provenance FROM tile_version WHERE layer = :layer AND tile = :tile
+
+-- name: put_provenance
+UPDATE tile_version SET provenance = :provenance WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: put_erased_row
+UPDATE report SET report_id = :report_id, vehicle = :vehicle, received_ns = :received_ns, body = :body
+WHERE arrival = :arrival
+
+-- name: named_basis_of_tile
+SELECT layer, tile, version, named FROM version_basis
+WHERE layer = :layer AND tile = :tile AND instr(named, :vehicle) > 0
+
+-- name: named_basis_of_store
+SELECT layer, tile, version, named FROM version_basis WHERE instr(named, :vehicle) > 0
+
+-- name: put_named_basis
+UPDATE version_basis SET named = :named WHERE layer = :layer AND tile = :tile AND version = :number
+
+-- name: named_closed_of_tile
+SELECT layer, tile, window, named FROM closed_window
+WHERE layer = :layer AND tile = :tile AND instr(named, :vehicle) > 0
+
+-- name: named_closed_of_store
+SELECT layer, tile, window, named FROM closed_window WHERE instr(named, :vehicle) > 0
+
+-- name: put_named_closed
+UPDATE closed_window SET named = :named WHERE layer = :layer AND tile = :tile AND window = :number
+
+-- name: rename_waiting_change
+UPDATE waiting_change SET vehicle = :name WHERE layer = :layer AND tile = :tile AND vehicle = :vehicle
+
+-- name: rename_doubted_report
+UPDATE doubted_report SET vehicle = :name, report_id = :new_id
+WHERE layer = :layer AND tile = :tile AND vehicle = :vehicle AND report_id = :report_id
+
+-- name: memory_of_tile
+SELECT memory FROM tile_memory WHERE layer = :layer AND tile = :tile
+
+-- name: tiles_with_memory
+SELECT layer, tile FROM tile_memory ORDER BY layer, tile
+
+-- name: put_erased_memory
+UPDATE tile_memory SET memory = :memory WHERE layer = :layer AND tile = :tile
+
+-- name: count_uploads
+SELECT COUNT(*) FROM upload
+WHERE vehicle = :vehicle OR report_id IN (SELECT report_id FROM upload WHERE vehicle = :vehicle)
+
+-- name: erase_uploads
+DELETE FROM upload WHERE vehicle = :vehicle OR report_id IN (SELECT report_id FROM upload WHERE vehicle = :vehicle)
+
+-- name: count_quarantined_messages
+SELECT COUNT(*) FROM quarantine
+WHERE instr(body, :name) > 0 OR instr(reason, :vehicle) > 0 OR instr(source, :vehicle) > 0
+
+-- name: erase_quarantined_messages
+DELETE FROM quarantine WHERE instr(body, :name) > 0 OR instr(reason, :vehicle) > 0 OR instr(source, :vehicle) > 0
+
+-- name: count_shift_tests
+SELECT COUNT(*) FROM shift_test WHERE vehicle = :vehicle
+
+-- name: erase_shift_tests
+DELETE FROM shift_test WHERE vehicle = :vehicle
+
+-- name: count_courses
+SELECT COUNT(*) FROM course_said WHERE vehicle = :vehicle
+
+-- name: erase_courses
+DELETE FROM course_said WHERE vehicle = :vehicle
+
+-- name: count_agreement_tests
+SELECT COUNT(*) FROM agreement_test WHERE vehicle = :vehicle
+
+-- name: erase_agreement_tests
+DELETE FROM agreement_test WHERE vehicle = :vehicle
+
+-- name: count_trial_health
+SELECT COUNT(*) FROM trial_health WHERE vehicle = :vehicle
+
+-- name: erase_trial_health
+DELETE FROM trial_health WHERE vehicle = :vehicle
+
+-- name: count_road_parts
+SELECT COUNT(*) FROM road_part WHERE vehicle = :vehicle
+
+-- name: erase_road_parts
+DELETE FROM road_part WHERE vehicle = :vehicle
+
+-- name: erase_pardon
+DELETE FROM pardon WHERE vehicle = :vehicle
+
+-- name: erase_quarantined
+DELETE FROM quarantined_vehicle WHERE vehicle = :vehicle
+
+-- name: erase_shifted
+DELETE FROM shifted_vehicle WHERE vehicle = :vehicle
+
+-- name: erase_left_waiting
+UPDATE waiting_change SET vehicle = :other WHERE vehicle = :vehicle
+
+-- name: erase_left_doubted
+UPDATE doubted_report SET vehicle = :other WHERE vehicle = :vehicle
+
+-- name: road_tiles_of_vehicles
+SELECT layer, tile, vehicles FROM road_tile ORDER BY layer, tile
+
+-- name: put_road_vehicles
+UPDATE road_tile SET vehicles = :vehicles WHERE layer = :layer AND tile = :tile
