@@ -17,6 +17,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.course import Course
 from gnd.schemas.drive import GnssFix
 from gnd.schemas.features import FeatureChange, FeatureReport
 from gnd.schemas.health import HealthReport, TileHealth
@@ -288,3 +289,15 @@ def test_rectangles_give_the_distances_of_tiles(corners: list[tuple[float, float
     tiles, here = [tile_at(*one) for one in corners], np.array([x_m, y_m, 0.0])
     found = TileRectangles.of(FRAME, tiles).distances_m(here)
     assert found == pytest.approx([tile_distance_m(FRAME, one, here) for one in tiles], abs=1e-9)
+
+
+@given(st.floats(-0.5, 0.5), st.floats(1e-4, 0.5))
+def test_a_private_course_is_one_of_few(turn_rad: float, sigma_rad: float) -> None:
+    said, told = Course.of(turn_rad, sigma_rad), replace(WHO, is_private=True).course_as_told
+    found = told(said)
+    assert found is not None
+    assert abs(found.turn_rad - turn_rad) <= 1.01e-3
+    assert found.turn_10urad % 200 == 0
+    assert found.sigma_rad >= max(said.sigma_rad, 2e-3)
+    assert WHO.course_as_told(said) == said
+    assert told(None) is None

@@ -57,6 +57,7 @@ SOON_VOXELS: Final = 48
 """Where so many voxels of one tile have changed, a report is due at once. On ground that has not changed, detection
 errs in up to some 30."""
 _HOUR_NS: Final = 3_600_000_000_000
+_COURSE_STEP_RAD: Final = 2e-3
 _SOON_S: Final = 0.3
 """Such a report waits this long for tiles that are left together with the first ..."""
 APART_S: Final = 3.0
@@ -80,6 +81,13 @@ class Identity:
     def begun_ns(self, t_ns: int) -> int:
         """The begin of the trip (ns) as it is told, in report ids and as the time of the first scan."""
         return t_ns - t_ns % _HOUR_NS if self.is_private else t_ns
+
+    def course_as_told(self, course: Course | None) -> Course | None:
+        """The course in the vehicle's own frame; its last digits would tell one vehicle from all others."""
+        if course is None or not self.is_private:
+            return course
+        steps = round(course.turn_rad / _COURSE_STEP_RAD)
+        return Course.of(steps * _COURSE_STEP_RAD, max(course.sigma_rad, _COURSE_STEP_RAD))
 
 
 @dataclass(slots=True)
@@ -425,7 +433,7 @@ class Reporter:
             last_ns=stretch.last_ns,
             tiles=tuple(changes),
             layer=who.layer,
-            course=self._course(),
+            course=who.course_as_told(self._course()),
         )
 
 
