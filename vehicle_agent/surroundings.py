@@ -5,6 +5,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -22,6 +23,11 @@ from gnd.vehicle_agent.place import Place
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
 AHEAD_S = 15.0  # tiles are asked for so long in advance, and at least `ahead_m`; longer than `LEAD_S`
+HELD_AHEAD_M: Final = 400.0
+"""Where the cache holds this share of what is farther ahead, whether that still holds is asked with the next question:
+one of its own costs 330 B with its answer, another tile in it some 3."""
+KNOWN_SHARE: Final = 0.25
+BEYOND_STEP_M: Final = 60.0
 LINK_SHARE = 0.8  # part of the link's rate that the plan counts on
 AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
 FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not show how high the world is
@@ -47,7 +53,9 @@ class Surroundings:
         self._rate_byte_s = LINK_SHARE * fetcher.link.rate_byte_s("down")
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
-        self._asked: set[TileId] = set()
+        self._asked: set[TileId] = set()  # with the last question, and not let go since
+        self._beyond: tuple[TileId, ...] = ()  # farther ahead than the plan
+        self._looked_beyond: F64 | None = None
         self._plan: list[Need] = []
         self._plan_is_new = False
         self._near: tuple[TileId, ...] = ()
@@ -56,10 +64,10 @@ class Surroundings:
         self.given_up: set[TileId] = set()
 
     def look_ahead(self, place: Place) -> tuple[TileId, ...]:
-        """Plan anew after a few metres of way; gives the tiles around and ahead."""
+        """Plan anew after a few metres of way; gives the tiles around and ahead, those of `HELD_AHEAD_M` included."""
         if self._has_moved(place):
             self._look(place)
-        return self.wanted
+        return (*self.wanted, *self._beyond)
 
     def follow(self, place: Place, stop: threading.Event, *, wait: bool) -> None:
         """Ask for what lies around and ahead and hold what is near; `wait` for the answers about that."""
@@ -109,6 +117,7 @@ class Surroundings:
         floor = int(np.floor(place.height_m / FLOORS_BELOW)) * FLOORS_BELOW
         self._map.cover_floors(floor - FLOORS_BELOW, floor + FLOORS_ABOVE)
         self.wanted = tiles_along(frame, place.ahead_map_m(self._ahead_m(place)), p.near_m)
+        self._look_beyond(place)
         self._plan = needs(frame, self.wanted, place.course, p.near_m)
         self._plan_is_new = True
         self._near = tuple(need.tile_id for need in self._plan if need.distance_m <= p.near_m)
@@ -116,16 +125,35 @@ class Surroundings:
         for tile in list(self._newer.values()):
             self.replace(tile)
 
+    def _look_beyond(self, place: Place) -> None:
+        """Which tiles lie farther ahead than the plan; found anew after some way, or where the course has turned."""
+        ahead = place.ahead_map_m(HELD_AHEAD_M)
+        before = self._looked_beyond
+        if before is None or before.shape != ahead.shape or np.abs(ahead - before).max() > BEYOND_STEP_M:
+            self._looked_beyond = ahead
+            tiles = tiles_along(self._map.grid_frame.frame, ahead, self._parameters.near_m)
+            self._beyond = tuple(sorted(set(tiles).difference(self.wanted)))
+
     def _ask(self, *, patiently: bool) -> None:
-        """Ask for the plan's tiles, all together, as soon as one of them is urgent; else only for those asked for
-        before. A drive that waits for its tiles gets all of them, another one what the link can bring in time.
+        """Ask for the plan's tiles, all together, as soon as one of them is urgent, and whether those beyond it still
+        hold that the cache has; else only for those asked for before. A drive that waits for its tiles gets all of
+        them, another one what the link can bring in time.
         """
         self._plan_is_new = False
         plan = self._plan if patiently else self._in_time()
         lead_s = LEAD_S + self._download_s(plan)
         if any(need.from_s <= lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
-            self._asked = {need.tile_id for need in plan}
-        self._fetcher.want([need.tile_id for need in plan if need.tile_id in self._asked])
+            self._asked = {need.tile_id for need in plan} | self._known_beyond()
+        first = [need.tile_id for need in plan if need.tile_id in self._asked]
+        self._fetcher.want([*first, *sorted(self._asked.difference(first))])
+
+    def _known_beyond(self) -> set[TileId]:
+        """The tiles beyond the plan, where the cache holds many of them; then the others are most likely on no map,
+        which costs little to hear, and else they are needed soon.
+        """
+        beyond = set(self._beyond).difference(self.wanted)
+        held = sum(map(self._fetcher.is_held, beyond))
+        return beyond if held >= KNOWN_SHARE * len(beyond) else set()
 
     def _in_time(self) -> list[Need]:
         if math.isinf(self._rate_byte_s):
@@ -141,7 +169,7 @@ class Surroundings:
     def _let_go(self, here: F64) -> None:
         """Drop tiles far behind that nothing is counted about, and answers about tiles that are no longer wanted."""
         frame, limit_m = self._map.grid_frame.frame, self._parameters.forget_m
-        gone = [t for t in self._arrived if t not in self.wanted]
+        gone = [t for t in self._arrived if t not in self.wanted and t not in self._asked]
         for tile_id in gone:
             del self._arrived[tile_id]
         for tile_id in left_behind(frame, self._map.tiles, here, limit_m):
@@ -151,6 +179,7 @@ class Surroundings:
                 gone.append(tile_id)
         for tile_id in gone:
             self._fetcher.forget(tile_id)
+        self._asked.difference_update(gone)
 
     def _arrive(self, fetched: Fetched[Tile]) -> None:
         """Take an answer: a tile (or the knowledge that there is none) waits until it is near."""

@@ -210,3 +210,31 @@ def test_the_distance_to_a_tile_is_measured_to_its_nearest_edge() -> None:
     assert tile_distance_m(frame, tile_id, corner) == pytest.approx(50.0, abs=0.01)
     assert left_behind(frame, [tile_id], corner, 49.0) == (tile_id,)
     assert left_behind(frame, [tile_id], corner, 51.0) == ()
+
+
+def test_what_the_cache_holds_is_asked_about_farther_ahead(scene: Scene) -> None:
+    """A second drive through known streets needs few questions, and is told all the same what has changed since."""
+    place = at(-60.0)
+    place.heading_rad, place.speed_mps = 0.0, 10.0
+
+    def drive() -> int:
+        before = sum(line.messages for line in scene.ledger.totals() if (line.kind, line.direction) == ("tile", "up"))
+        for east_m in range(-60, 61):
+            place.position_map_m = at(float(east_m)).position_map_m
+            scene.surroundings.follow(place, NEVER, wait=True)
+        lines = scene.ledger.totals()
+        return sum(line.messages for line in lines if (line.kind, line.direction) == ("tile", "up")) - before
+
+    first = drive()
+    for tile_id in list(scene.map.tiles):
+        scene.map.remove_tile(tile_id)
+        scene.fetcher.forget(tile_id)
+    scene.surroundings = Surroundings(scene.map, scene.fetcher, scene.detector.touched, PARAMETERS)
+    changed = next(
+        tile for tile in scene.tiles.values() if FRAME.enu_from_geodetic(*tile.tile_id.centre_rad, 0.0)[0] > 5
+    )
+    scene.store.put_tiles([Tile(changed.tile_id, 2, changed.gaussians.take(np.arange(len(changed.gaussians)) > 3))])
+    assert drive() <= min(first, 4)
+    held = scene.map.tile(changed.tile_id)
+    assert held is not None
+    assert held.version == 2

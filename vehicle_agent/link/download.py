@@ -129,6 +129,13 @@ class TileFetcher(Generic[TileT]):
         with self._changed:
             return tile_id in self._in_flight or (tile_id in self._answered and tile_id not in self._stale)
 
+    def is_held(self, tile_id: TileId) -> bool:
+        """Whether the cache has a version of it."""
+        try:
+            return bool(self._cache.head(tile_id)[0])
+        except CacheError:
+            return False
+
     def size_bytes(self, tile_id: TileId) -> float:
         """What the answer about a tile is likely to weigh: of one that is held little, of one not held the mean."""
         if self.is_known(tile_id):
