@@ -27,7 +27,7 @@ JUDGED_VOXELS: Final = 12
 REFUTED_CLAIMS: Final = 0.6
 """A report is refuted where others contradict this share of the changes that it claims, ..."""
 REFUTED_QUOTES: Final = 0.8
-"""... or this share of what it says is as it was, where they say that it has changed: that is missed more easily."""
+"""... or where it says "as it was" of this share of what they have clearly found changed before it came."""
 DENIED_CLAIM: Final = 2
 DENIED_QUOTE: Final = 3
 """So many others must contradict a statement, and more than say it, the vehicle itself among them. Of a claim those who
@@ -88,13 +88,30 @@ def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> A
     agree = np.where(claim, agree, quotes_before + quotes_after)
     deny = np.where(claim, quotes_after, np.maximum(gone_before, there_before))
     least = np.where(claim, DENIED_CLAIM, DENIED_QUOTE)
-    judged = (agree + deny >= least) & (claim | quotes)
+    judged = claim & (agree + deny >= least)
     refuted = judged & (deny >= least) & (deny > agree + 1)
+    # Of "as it was" only what others have clearly found changed says something, whether the vehicle says so or not:
+    # what one of them claims wrongly all others quote, and a vehicle that never sees a change would agree with most.
+    before, still = np.maximum(gone_before, there_before), quotes_before + quotes_after
+    changed = (claim | quotes) & (before >= DENIED_QUOTE) & (before > still + 1)
     tests = []
     for number, report in enumerate(reports):
         own = rows["report"] == number
-        tests.append(_test_of(report, rows["voxel_id"], own & judged, own & refuted, claim, epoch))
+        of_it = _Judged(own & judged, own & refuted, own & changed, claim)
+        tests.append(_test_of(reports, report, rows["voxel_id"], of_it, epoch))
     return Agreement(tuple(one for one in tests if one is not None), contradicted)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """(M,) of one report: claims that others can judge, those that they refute, what they have clearly found changed
+    before; and which rows are claims.
+    """
+
+    claims: Mask
+    refuted: Mask
+    changed: Mask
+    claim: Mask
 
 
 def _around(voxel_id: NDArray[np.int32], which: Mask) -> tuple[I64, I64]:
@@ -120,26 +137,31 @@ def _contradicted(
 
 
 def _test_of(
-    report: Report, voxel_id: NDArray[np.int32], judged: Mask, refuted: Mask, claim: Mask, epoch: Gaussians
+    reports: Sequence[Report], report: Report, voxel_id: NDArray[np.int32], own: _Judged, epoch: Gaussians
 ) -> AgreementTest | None:
-    claims, quotes = int((judged & claim).sum()), int((judged & ~claim).sum())
-    if max(claims, quotes) < JUDGED_VOXELS:
+    claims, wrong_claims = int(own.claims.sum()), int(own.refuted.sum())
+    changed, missed = int(own.changed.sum()), int((own.changed & ~own.claim).sum())
+    if max(claims, changed) < JUDGED_VOXELS:
         return None
-    wrong_claims, wrong_quotes = int((refuted & claim).sum()), int((refuted & ~claim).sum())
     by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
     if by_claims:  # what parks and leaves that come differ from drive to drive, and are nobody's fault
-        lasting = ~are_in(voxel_id, _passing(report, voxel_id[judged & claim], epoch))
-        claims, wrong_claims = int((judged & claim & lasting).sum()), int((refuted & claim & lasting).sum())
+        lasting = ~are_in(voxel_id, _passing(report, voxel_id[own.claims], epoch))
+        claims, wrong_claims = int((own.claims & lasting).sum()), int((own.refuted & lasting).sum())
         by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
-    by_quotes = quotes >= JUDGED_VOXELS and wrong_quotes >= REFUTED_QUOTES * quotes
+    by_quotes = changed >= JUDGED_VOXELS and missed >= REFUTED_QUOTES * changed
+    if by_quotes:  # what had parked may have gone again
+        parked = [_passing(one, voxel_id[own.changed], epoch) for one in reports if one is not report]
+        lasting = ~are_in(voxel_id, np.unique(np.concatenate(parked)).astype(np.int32))
+        changed, missed = int((own.changed & lasting).sum()), int((own.changed & lasting & ~own.claim).sum())
+        by_quotes = changed >= JUDGED_VOXELS and missed >= REFUTED_QUOTES * changed
     return AgreementTest(
         report_id=report.report_id,
         vehicle=report.vehicle,
         at_ns=report.last_ns,
         claims=claims,
         refuted_claims=wrong_claims,
-        quotes=quotes,
-        refuted_quotes=wrong_quotes,
+        quotes=changed,
+        refuted_quotes=missed,
         is_refuted=by_claims or by_quotes,
     )
 

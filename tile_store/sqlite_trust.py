@@ -16,7 +16,9 @@ from gnd.tile_store.values import QUARANTINED, AgreementTest, Basis, VehicleTrus
 REFUTED_TILES: Final = 3
 """A vehicle does not count any more when others have contradicted it in so many tiles, ..."""
 REFUTED_SHARE: Final = 0.5
-"""... if they are so many of all in which they could."""
+"""... if they are so many of all in which they could, ..."""
+REFUTED_STATEMENTS: Final = 0.4
+"""... or if they have contradicted so many of all its statements: where two of three lie, no tile says it clearly."""
 
 
 def put_tests(
@@ -47,9 +49,12 @@ def put_tests(
     known = {one.vehicle: one for one in quarantined(c)} if vehicles else {}
     for vehicle in sorted(vehicles):
         found = trust_of(c, vehicle)
-        is_bad = found.refuted >= REFUTED_TILES and found.refuted >= REFUTED_SHARE * found.tested
+        said, wrong = found.claims + found.quotes, found.refuted_claims + found.refuted_quotes
+        is_bad = found.refuted >= REFUTED_TILES and (
+            found.refuted >= REFUTED_SHARE * found.tested or wrong >= REFUTED_STATEMENTS * said
+        )
         if is_bad and vehicle not in known:
-            why = f"others contradict it in {found.refuted} of {found.tested} tiles"
+            why = f"others contradict it in {found.refuted} of {found.tested} tiles, {wrong} of {said} statements"
             told = {"vehicle": vehicle, "since_ns": timing["now"], "source": "agreement", "why": why}
             change(c, "quarantine_vehicle", told)
             _merge_its_tiles_again(c, vehicle, timing)
