@@ -4,7 +4,7 @@ from pathlib import Path
 
 from parameter_inventory import inventory
 
-MOST = 124  # 117, a simulated world (0137), identity (0150), rights (0151), who gets new versions first (0157: two)
+MOST = 126  # 117, a simulated world (0137), identity (0150), rights (0151), releases (0157: two), privacy (0156: two)
 """There were 547 before docs/decisions/0122-settings.md; more than now need a reason."""
 OF_A_SESSION = {"BusConfig"}
 
