@@ -97,13 +97,13 @@ def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> A
     tests = []
     for number, report in enumerate(reports):
         own = rows["report"] == number
-        of_it = _Judged(own & judged, own & refuted, own & changed, claim)
+        of_it = _Statements(own & judged, own & refuted, own & changed, claim)
         tests.append(_test_of(reports, report, rows["voxel_id"], of_it, epoch))
     return Agreement(tuple(one for one in tests if one is not None), contradicted)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Judged:
+class _Statements:
     """(M,) of one report: claims that others can judge, those that they refute, what they have clearly found changed
     before; and which rows are claims.
     """
@@ -137,7 +137,7 @@ def _contradicted(
 
 
 def _test_of(
-    reports: Sequence[Report], report: Report, voxel_id: NDArray[np.int32], own: _Judged, epoch: Gaussians
+    reports: Sequence[Report], report: Report, voxel_id: NDArray[np.int32], own: _Statements, epoch: Gaussians
 ) -> AgreementTest | None:
     claims, wrong_claims = int(own.claims.sum()), int(own.refuted.sum())
     changed, missed = int(own.changed.sum()), int((own.changed & ~own.claim).sum())

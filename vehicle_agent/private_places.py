@@ -115,7 +115,7 @@ class Circles:
 
 
 @dataclass(frozen=True, slots=True)
-class _Waiting:
+class _KeptBack:
     """What is to leave the vehicle once it is far enough: a report or a word on trials.
 
     Attributes:
@@ -149,7 +149,7 @@ class PrivatePlaces:
         self._hiding = [circles.at(self._frame, self._here_m)]
         self._lock = threading.RLock()
         self._has_ended = False
-        self._waiting: list[_Waiting] = []
+        self._waiting: list[_KeptBack] = []
         self._said: list[HealthReport] = []
         self._hidden: set[str] = set()  # surveys
         self.counts: Counter[str] = Counter()
@@ -180,7 +180,7 @@ class PrivatePlaces:
     def say(self, told: Collection[HealthReport]) -> list[HealthReport]:
         """Take words on trials; gives those that may be said now."""
         with self._lock:
-            self._waiting += [_Waiting(self._lie([tile.tile for tile in one.tiles]), one) for one in told]
+            self._waiting += [_KeptBack(self._lie([tile.tile for tile in one.tiles]), one) for one in told]
             self._look()
             free, self._said = self._said, []
         return free
@@ -220,12 +220,12 @@ class PrivatePlaces:
         else:
             self._sink.put(what.report_id, what.key, what.body, what.packed, what.bases)
 
-    def _is_hidden(self, one: _Waiting) -> bool:
+    def _is_hidden(self, one: _KeptBack) -> bool:
         if len(one.where.low_m) == 0:
             return self._has_ended  # nothing says where it was
         return self._hide(one.where)
 
-    def _is_far(self, one: _Waiting) -> bool:
+    def _is_far(self, one: _KeptBack) -> bool:
         """Whether the trip cannot end near it; the parts of a survey belong together."""
         return not one.survey_id and bool((one.where.distances_m(self._here_m) > self._hold_m).all())
 
@@ -235,14 +235,14 @@ class PrivatePlaces:
     def _lie(self, tiles: Iterable[TileId]) -> TileRectangles:
         return TileRectangles.of(self._frame, tiles)
 
-    def _read(self, report: OutgoingReport) -> _Waiting:
+    def _read(self, report: OutgoingReport) -> _KeptBack:
         """What a report speaks of."""
         if is_survey(report.body):
             survey = SurveyReport.decode(report.body)
             geodetic = np.array([(fix.lat_rad, fix.lon_rad, fix.height_m) for fix in survey.fixes]).reshape(-1, 3)
             seen_m = self._frame.enu_from_geodetic(*geodetic.T)[:, :2]
-            return _Waiting(TileRectangles(seen_m, seen_m), report, survey.survey_id)
+            return _KeptBack(TileRectangles(seen_m, seen_m), report, survey.survey_id)
         layer, _ = parse_change_key(report.key)
         if is_feature_layer(layer):
-            return _Waiting(self._lie(one.tile for one in FeatureReport.decode(report.body).tiles), report)
-        return _Waiting(self._lie(one.tile for one in ChangeReport.decode(report.body).tiles), report)
+            return _KeptBack(self._lie(one.tile for one in FeatureReport.decode(report.body).tiles), report)
+        return _KeptBack(self._lie(one.tile for one in ChangeReport.decode(report.body).tiles), report)
