@@ -39,6 +39,7 @@ def test_attack_one_report_again_and_again(cloud: Cloud) -> None:
     street.say("a", NOTHING, at_s=200)
     street.say("b", NOTHING, at_s=260)
     street.settle()
+    street.judge()
     assert street.shas == street.untouched
     assert street.quarantined() == {"bad"}
 
@@ -52,6 +53,7 @@ def test_attack_three_collude_against_five(cloud: Cloud) -> None:
     for name in "abcde":
         street.say(name, NOTHING)
     street.settle()
+    street.judge()
     assert street.shas == street.untouched
     assert street.quarantined() == {"x", "y", "z"}
 
@@ -73,6 +75,7 @@ def test_attack_one_bad_of_three(cloud: Cloud) -> None:
     street.say("a", NOTHING)
     street.say("b", NOTHING)
     street.settle()
+    street.judge()
     assert street.shas == street.untouched
     assert street.quarantined() == {"bad"}
 
@@ -140,6 +143,7 @@ def test_attack_lies_while_the_shard_dies(cloud: Cloud) -> None:
     cloud.kill(SHARD)
     cloud.start(SHARD)
     street.settle()
+    street.judge()
     assert street.quarantined() == {"bad"}
     assert street.shas == street.untouched
 
@@ -168,6 +172,7 @@ def test_attack_two_that_invent_the_same_against_four(cloud: Cloud) -> None:
     for name in "abcd":
         street.say(name, NOTHING)
     street.settle()
+    street.judge()
     assert street.shas == street.untouched
     assert street.quarantined() == {"x", "y"}
 
