@@ -94,22 +94,24 @@ def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> A
     # what one of them claims wrongly all others quote, and a vehicle that never sees a change would agree with most.
     before, still = np.maximum(gone_before, there_before), quotes_before + quotes_after
     changed = (claim | quotes) & (before >= DENIED_QUOTE) & (before > still + 1)
+    quoted = quotes & (before + still >= DENIED_QUOTE)
     tests = []
     for number, report in enumerate(reports):
         own = rows["report"] == number
-        of_it = _Statements(own & judged, own & refuted, own & changed, claim)
+        of_it = _Statements(own & judged, own & refuted, own & quoted, own & changed, claim)
         tests.append(_test_of(reports, report, rows["voxel_id"], of_it, epoch))
     return Agreement(tuple(one for one in tests if one is not None), contradicted)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Statements:
-    """(M,) of one report: claims that others can judge, those that they refute, what they have clearly found changed
-    before; and which rows are claims.
+    """(M,) of one report: claims that others can judge, those that they refute, what it says is as it was and others
+    speak of, too, what they have clearly found changed before; and which rows are claims.
     """
 
     claims: Mask
     refuted: Mask
+    quotes: Mask
     changed: Mask
     claim: Mask
 
@@ -141,8 +143,8 @@ def _test_of(
 ) -> AgreementTest | None:
     claims, wrong_claims = int(own.claims.sum()), int(own.refuted.sum())
     changed, missed = int(own.changed.sum()), int((own.changed & ~own.claim).sum())
-    if max(claims, changed) < JUDGED_VOXELS:
-        return None
+    if max(claims, changed, int(own.quotes.sum())) < JUDGED_VOXELS:
+        return None  # else there is a test, whatever it says: those who come later may clear whom the first made wrong
     by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
     if by_claims:  # what parks and leaves that come differ from drive to drive, and are nobody's fault
         lasting = ~are_in(voxel_id, _passing(report, voxel_id[own.claims], epoch))
