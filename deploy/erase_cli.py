@@ -9,11 +9,10 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd.deploy.vehicle_rollback_cli import PREFIX
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.options import PATH, bars, existing, json_option, show
 from gnd.tile_store.sqlite_erase import compact
-
-PREFIX = "vehicle:"
 
 
 @click.command(short_help="Make the reports of a vehicle nobody's.")

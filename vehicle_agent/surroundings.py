@@ -17,7 +17,7 @@ from gnd.gnd_map.tile_id import TileId, covering_corridor
 from gnd.tile_client.exchange import Fetched
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
 from gnd.vehicle_agent.link.download import TileFetcher
-from gnd.vehicle_agent.link.plan import Need, in_time, needs
+from gnd.vehicle_agent.link.plan import Need, in_time, needs, tile_boxes_m
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
 
@@ -226,9 +226,7 @@ class TileRectangles:
     @classmethod
     def of(cls, frame: LocalFrame, tiles: Iterable[TileId]) -> "TileRectangles":
         """Where tiles lie in a frame."""
-        corners = np.array([(one.south_west_rad, one.north_east_rad) for one in tiles]).reshape(-1, 2)
-        enu_m = frame.enu_from_geodetic(corners[:, 0], corners[:, 1], np.zeros(len(corners)))[:, :2]
-        return cls(enu_m[0::2], enu_m[1::2])
+        return cls(*tile_boxes_m(frame, tuple(tiles)))
 
     def distances_m(self, p_map_m: F64) -> F64:
         """(N,) horizontal distances of a point (3,), 0 inside: `tile_distance_m` of each."""
