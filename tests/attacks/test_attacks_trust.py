@@ -179,7 +179,7 @@ def test_attack_two_that_invent_the_same_against_four(cloud: Cloud) -> None:
 
 @pytest.mark.xfail(reason="docs/trust.md, what it cannot do: who comes first and together", strict=False)
 def test_three_that_lie_before_anybody_else_comes_are_outvoted(cloud: Cloud) -> None:
-    """What does not work yet: three vehicles lie together first; six honest ones, each settled, do not bring it back."""
+    """What does not work yet: three vehicles lie together first; six honest ones, one by one, do not bring it back."""
     street = Street(cloud, 20)
     for name in "xyz":
         street.say(name, {tile: {**street.gone[tile], **street.built[tile]} for tile in street.tiles})
