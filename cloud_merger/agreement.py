@@ -85,11 +85,8 @@ def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> A
     # who agrees counts whenever it came, and so does the vehicle itself: three that lie first must not make those wrong
     # who come after them, before the others have
     agree = np.where(gone, gone_before + gone_after, there_before + there_after)
-    agree = np.where(claim, agree, quotes_before + quotes_after)
-    deny = np.where(claim, quotes_after, np.maximum(gone_before, there_before))
-    least = np.where(claim, DENIED_CLAIM, DENIED_QUOTE)
-    judged = claim & (agree + deny >= least)
-    refuted = judged & (deny >= least) & (deny > agree + 1)
+    judged = claim & (agree + quotes_after >= DENIED_CLAIM)
+    refuted = judged & (quotes_after >= DENIED_CLAIM) & (quotes_after > agree + 1)
     # Of "as it was" only what others have clearly found changed says something, whether the vehicle says so or not:
     # what one of them claims wrongly all others quote, and a vehicle that never sees a change would agree with most.
     before, still = np.maximum(gone_before, there_before), quotes_before + quotes_after
