@@ -24,6 +24,8 @@ from gnd.schemas.updates import TileUpdate
 from gnd.tile_store.sqlite_store import SqliteStore
 
 DEADLINE_S = 90.0
+TAKEN = ("stored", "duplicate")
+"""What a vehicle hears of a good report: shards that do not know each other yet both answer, and an ack may be lost."""
 FAST = """poll_s = 0.05
 bus_lease_ms = 1500
 [store]

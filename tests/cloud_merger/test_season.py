@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from merger_processes import Cloud, wait_for
+from merger_processes import TAKEN, Cloud, wait_for
 from merger_world import TILE, change_of, report_of
 
 from gnd.cloud_merger import window
@@ -52,7 +52,7 @@ def gnd_map(*arguments):
 def test_leaves_that_fell_wait_as_such_and_are_computed_anew(cloud, monkeypatch):
     cloud.start("first")
     for number in (1, 2, 3):
-        assert cloud.send(of_winter(number)).status == "stored"
+        assert cloud.send(of_winter(number)).status in TAKEN
     wait_for("all are merged", lambda: cloud.is_settled() and len(cloud.store.in_play("ndt", TILE).reports) == 3)
     head = cloud.store.get("ndt", TILE).decode_gaussians().gaussians
     new_house = np.setdiff1d(WINTER.voxel_id, SUMMER.voxel_id)
