@@ -3,8 +3,9 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
-# Tests run in two processes: many of them start fleets of their own, more would only wait for each other.
-TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 2 || echo 0)
+# Tests run in three processes, also on two cores: those of the bus and of attacks wait for much of their time.
+# Whole fleets run one after the other in one of them: they need the cores.
+TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 3 || echo 0)
 SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1

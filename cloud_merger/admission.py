@@ -3,9 +3,11 @@
 Each vehicle has a bucket of reports and one of bytes, which fill at a steady rate; so has its owner, where certificates
 tell owners. Without identity a name costs nothing: therefore new names are a bucket of their own, and begin with a part
 of what a vehicle that is known may send at once. What waits to be looked at is bounded for each vehicle and in all, by
-the store, which all shards share. Who is beyond a limit is told how long to wait, and loses nothing.
+the store, which all shards share. Who is beyond a limit is told how long to wait, and loses nothing. While vehicles
+that are known send reports, those of newcomers wait a moment for a commit that the others cause anyway.
 """
 
+import math
 import threading
 import time
 from collections import OrderedDict
@@ -43,6 +45,9 @@ WAITING_RETRY_S: Final = 5.0
 LONGEST_RETRY_S: Final = 60.0
 LOOK_EVERY_S: Final = 0.5
 KNOWN_AFTER_S: Final = 30.0
+KNOWN_COME_S: Final = 10.0
+"""Newcomers are patient while a known vehicle has come within so long."""
+PATIENT_S: Final = 0.1
 _MINUTE_S: Final = 60.0
 
 
@@ -116,18 +121,24 @@ class Admission:
         self._names = TokenBucket(NAMES_A_MINUTE, NAMES_AT_ONCE, clock_s())
         self._nonsense = TokenBucket(NONSENSE_A_MINUTE, NONSENSE_AT_ONCE, clock_s())
         self._waiting, self._looked_s = 0, clock_s() - LOOK_EVERY_S
+        self._known_s = -math.inf
 
     def __len__(self) -> int:
         return len(self._accounts)
 
-    def admit(self, key: str, head: UploadHead, size_bytes: int) -> None:
+    def admit(self, key: str, head: UploadHead, size_bytes: int) -> float:
         """Take one upload out of its vehicle's buckets.
+
+        Returns:
+            How long it is to wait for a commit that others cause, s.
 
         Raises:
             Busy: with numbers, and how long to wait.
             StoreError: the store cannot be read.
         """
         vehicle = head.vehicle or self._vehicle_of(key, head.report_id)
+        with self._lock:  # an invented name that is one too many costs no look into the store
+            self._account(vehicle, self._clock_s())
         waiting = self._store.uploads_waiting(head.vehicle, WAITING_OF_VEHICLE) if head.vehicle else 0
         if waiting >= WAITING_OF_VEHICLE:
             raise Busy(
@@ -139,12 +150,15 @@ class Admission:
         with self._lock:
             now_s = self._clock_s()
             account = self._account(vehicle, now_s)
-            self._check_all(in_all, now_s - account.since_s >= KNOWN_AFTER_S)
+            is_known = now_s - account.since_s >= KNOWN_AFTER_S
+            self._check_all(in_all, is_known)
             owner = self._owner_of(vehicle)
             for one in (account, *([self._owner(owner, now_s)] if owner else [])):
                 _check(one, vehicle, size_bytes, now_s)
                 one.reports.take(1)
                 one.size.take(size_bytes)
+            self._known_s = now_s if is_known else self._known_s
+            return PATIENT_S if not is_known and now_s - self._known_s < KNOWN_COME_S else 0.0
 
     def admit_nonsense(self) -> None:
         """Take one message that cannot be read, and is to be kept in quarantine.

@@ -7,19 +7,19 @@ vehicle is its own witness. Single contradictions are normal: things move, and a
 A function of the window's reports alone, not of who is believed: so who is named depends on the journal, in any order.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.cloud_merger.statements import Kind, Report, Statements
+from gnd.cloud_merger.caps import CAP_OWNER_NAMES
+from gnd.cloud_merger.hearing import Hearing, Said, Spoken, passing
+from gnd.cloud_merger.statements import Report, Statements
 from gnd.gnd_map.arrays import are_in
-from gnd.gnd_map.foliage import follows_season
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.grid import VoxelGrid
-from gnd.gnd_map.vehicle_shape import has_vehicle_shape
 from gnd.tile_store.values import AgreementTest
 
 JUDGED_VOXELS: Final = 12
@@ -49,55 +49,58 @@ class Agreement:
     Attributes:
         tests: of each report that others can judge.
         contradicted: the vehicles that are not believed alone in this tile.
+        denied: of each vehicle its claims that somebody else has seen, too, and how many of them more deny than say the
+            same.
     """
 
     tests: tuple[AgreementTest, ...] = ()
     contradicted: frozenset[str] = frozenset()
+    denied: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
-def agreement_of(epoch: Gaussians, statements: Statements, for_epoch: Mask) -> Agreement:
+def agreement_of(epoch: Gaussians, statements: Statements, spoken: Spoken, found: Hearing) -> Agreement:
     """How the reports of a window agree.
 
     Args:
         epoch: the tile that the reports are merged into.
         statements: of all reports of the window, believed or not.
-        for_epoch: (M,) which of them say that a voxel is as in the epoch.
+        spoken: what they say.
+        found: who is heard; the others are judged and judge nobody.
     """
-    reports, rows = statements.reports, statements.rows
-    if len({one.vehicle for one in reports}) < 2 or not len(for_epoch):
+    reports = statements.reports
+    if len(spoken.names) < 2 or not len(spoken.at):
         return Agreement()
-    told = np.flatnonzero((rows["report"] >= 0) & (rows["report"] < len(reports)))
-    time_ns = np.array([one.last_ns for one in reports], np.int64)[rows["report"][told]]
-    told = told[np.lexsort((rows["report"][told], time_ns, rows["voxel_id"][told]))]
-    rows, quotes = rows[told], for_epoch[told] & ~rows["claim"][told]
-    claim = rows["claim"]
-    gone, there = claim & (rows["kind"] == Kind.NOTHING), claim & (rows["kind"] != Kind.NOTHING)
-    (gone_before, gone_after), (there_before, there_after), (quotes_before, quotes_after) = (
-        _around(rows["voxel_id"], which) for which in (gone, there, quotes)
+    time_ns = np.array([one.last_ns for one in reports], np.int64)[spoken.report]
+    told = spoken.take(np.lexsort((spoken.report, time_ns, spoken.seat)))
+    heard, gone, there = found.counts[told.at], told.said == Said.GONE, np.isin(told.said, (Said.NEW, Said.MODIFIED))
+    claim = gone | there
+    same = told.said == Said.SAME
+    (gone_before, gone_after), (there_before, there_after), (same_before, same_after) = (
+        _voices_around(told, which & heard) for which in (gone, there, same)
     )
-    contradicted = _contradicted(
-        reports,
-        rows["report"],
-        claim,
-        np.where(gone, gone_before + gone_after, there_before + there_after),
-        quotes_before + quotes_after,
-    )
+    agree = np.where(gone, gone_before + gone_after, there_before + there_after)
+    n_judged, n_denied = _denied(len(reports), told.report, claim, agree, same_before + same_after)
+    # what the tile holds now was claimed rightly against an older version
+    settled = np.bincount(told.report[(told.restated != Said.OPEN) & (same_before + same_after > 0)])
+    n_settled = np.pad(settled, (0, len(reports) - len(settled)))
     # who agrees counts whenever it came, and so does the vehicle itself: three that lie first must not make those wrong
     # who come after them, before the others have
-    agree = np.where(gone, gone_before + gone_after, there_before + there_after)
-    judged = claim & (agree + quotes_after >= DENIED_CLAIM)
-    refuted = judged & (quotes_after >= DENIED_CLAIM) & (quotes_after > agree + 1)
+    restated = (told.restated != Said.OPEN) & (same_before + same_after >= DENIED_CLAIM)
+    judged = claim & (agree + same_after >= DENIED_CLAIM) | restated
+    refuted = claim & judged & (same_after >= DENIED_CLAIM) & (same_after > agree + 1)
     # Of "as it was" only what others have clearly found changed says something, whether the vehicle says so or not:
     # what one of them claims wrongly all others quote, and a vehicle that never sees a change would agree with most.
-    before, still = np.maximum(gone_before, there_before), quotes_before + quotes_after
-    changed = (claim | quotes) & (before >= DENIED_QUOTE) & (before > still + 1)
-    quoted = quotes & (before + still >= DENIED_QUOTE)
-    tests = []
+    before, still = np.maximum(gone_before, there_before), same_before + same_after
+    changed = (told.said != Said.OPEN) & (before >= DENIED_QUOTE) & (before > still + 1)
+    quoted = same & (before + still >= DENIED_QUOTE)
+    voxel_id, tests = statements.rows["voxel_id"][told.at], []
     for number, report in enumerate(reports):
-        own = rows["report"] == number
+        own = told.report == number
         of_it = _Statements(own & judged, own & refuted, own & quoted, own & changed, claim)
-        tests.append(_test_of(reports, report, rows["voxel_id"], of_it, epoch))
-    return Agreement(tuple(one for one in tests if one is not None), contradicted)
+        tests.append(_test_of(reports, report, voxel_id, of_it, epoch))
+    contradicted = _contradicted(reports, n_judged, n_denied)
+    denied = _by_vehicle(reports, n_judged + n_settled, n_denied)
+    return Agreement(tuple(one for one in tests if one is not None), contradicted, denied)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,9 +116,20 @@ class _Statements:
     claim: Mask
 
 
-def _around(voxel_id: NDArray[np.int32], which: Mask) -> tuple[I64, I64]:
-    """(M,) how many rows of `which` come before and behind each row in its voxel; `voxel_id` is sorted."""
-    first = np.append(True, voxel_id[1:] != voxel_id[:-1])[: len(voxel_id)]
+def _voices_around(told: Spoken, which: Mask) -> tuple[I64, I64]:
+    """The same of statements; of an owner of other vehicles one is heard."""
+    before, after = _around(told.seat, which & (told.owner < 0))
+    for owner in np.unique(told.owner[told.owner >= 0]).tolist():
+        own = told.owner == owner
+        own_before, own_after = _around(told.seat, which & own)
+        before += np.where(own, own_before, np.minimum(own_before, CAP_OWNER_NAMES))
+        after += np.where(own, own_after, np.minimum(own_after, CAP_OWNER_NAMES))
+    return before, after
+
+
+def _around(seat: I64, which: Mask) -> tuple[I64, I64]:
+    """(M,) how many rows of `which` come before and behind each row in its voxel; `seat` is sorted."""
+    first = np.append(True, seat[1:] != seat[:-1])[: len(seat)]
     group = np.cumsum(first) - 1
     until = np.cumsum(which)
     start: I64 = (until - which)[first][group]
@@ -124,13 +138,23 @@ def _around(voxel_id: NDArray[np.int32], which: Mask) -> tuple[I64, I64]:
     return before, total - before - which
 
 
-def _contradicted(
-    reports: Sequence[Report], report: NDArray[np.int32], claim: Mask, agree: I64, deny: I64
-) -> frozenset[str]:
-    """Vehicles of whose claims others deny many; somebody else must have seen the voxel."""
+def _denied(n: int, report: I64, claim: Mask, agree: I64, deny: I64) -> tuple[I64, I64]:
+    """(n,) claims of each report of whose voxels somebody else has spoken, too, and how many of them are denied."""
     judged, denied = claim & (agree + deny > 0), claim & (deny > agree)
-    n_judged = np.bincount(report[judged], minlength=len(reports))
-    n_denied = np.bincount(report[denied], minlength=len(reports))
+    return np.bincount(report[judged], minlength=n), np.bincount(report[denied], minlength=n)
+
+
+def _by_vehicle(reports: Sequence[Report], n_judged: I64, n_denied: I64) -> dict[str, tuple[int, int]]:
+    found: dict[str, tuple[int, int]] = defaultdict(lambda: (0, 0))
+    for report, judged, denied in zip(reports, n_judged.tolist(), n_denied.tolist(), strict=True):
+        if report.vehicle:
+            before = found[report.vehicle]
+            found[report.vehicle] = before[0] + judged, before[1] + denied
+    return dict(found)
+
+
+def _contradicted(reports: Sequence[Report], n_judged: I64, n_denied: I64) -> frozenset[str]:
+    """Vehicles of whose claims others deny many."""
     found = (n_denied >= CONTRADICTED_VOXELS) & (n_denied >= CONTRADICTED_SHARE * n_judged)
     return frozenset(one.vehicle for one, is_found in zip(reports, found, strict=True) if is_found and one.vehicle)
 
@@ -144,12 +168,12 @@ def _test_of(
         return None  # else there is a test, whatever it says: those who come later may clear whom the first made wrong
     by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
     if by_claims:  # what parks and leaves that come differ from drive to drive, and are nobody's fault
-        lasting = ~are_in(voxel_id, _passing(report, voxel_id[own.claims], epoch))
+        lasting = ~are_in(voxel_id, passing(report, epoch))
         claims, wrong_claims = int((own.claims & lasting).sum()), int((own.refuted & lasting).sum())
         by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
     by_quotes = changed >= JUDGED_VOXELS and missed >= REFUTED_QUOTES * changed
     if by_quotes:  # what had parked may have gone again
-        parked = [_passing(one, voxel_id[own.changed], epoch) for one in reports if one is not report]
+        parked = [passing(one, epoch) for one in reports if one is not report]
         lasting = ~are_in(voxel_id, np.unique(np.concatenate(parked)).astype(np.int32))
         changed, missed = int((own.changed & lasting).sum()), int((own.changed & lasting & ~own.claim).sum())
         by_quotes = changed >= JUDGED_VOXELS and missed >= REFUTED_QUOTES * changed
@@ -163,18 +187,3 @@ def _test_of(
         refuted_quotes=missed,
         is_refuted=by_claims or by_quotes,
     )
-
-
-def _passing(report: Report, claimed: NDArray[np.int32], epoch: Gaussians) -> NDArray[np.int32]:
-    """Voxels of a report's claims that have the shape of a standing vehicle, come or gone, or follow the season."""
-    grid, changed = VoxelGrid.of(report.change.tile), report.change.changed
-    come = changed.take(changed.exists & ~are_in(changed.voxel_id, epoch.voxel_id))
-    left = np.intersect1d(changed.voxel_id[~changed.exists], epoch.voxel_id).astype(np.int32)
-    stood = epoch.take(are_in(epoch.voxel_id, left))
-    rest = epoch.take(~are_in(epoch.voxel_id, left))
-    found = [
-        come.voxel_id[has_vehicle_shape(grid, epoch, come)],
-        stood.voxel_id[has_vehicle_shape(grid, rest, stood)],
-        follows_season(grid, epoch, left, come),
-    ]
-    return np.intersect1d(np.concatenate(found), claimed).astype(np.int32)

@@ -20,6 +20,7 @@ from gnd.gnd_map.tile import Tile, diff
 from gnd.schemas.errors import SchemaError, TooLarge
 from gnd.schemas.keys import update_key
 from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.errors import StoreDamaged
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import Notice, StoredTile
 
@@ -77,6 +78,11 @@ class Announcer:
         if stored is None:
             _LOG.info("%s version %d went before it was announced", notice.tile, notice.version)
             return
+        try:
+            self._store.check_signed(stored)
+        except StoreDamaged as error:  # the notice's seal would make somebody else's version ours
+            _LOG.error("not announced: %s", error)
+            return
         parent = self._store.get(notice.layer, notice.tile, stored.parent) if stored.parent else None
         key = update_key(notice.layer, notice.tile)
         self._publisher(key).put(encoded(update_of(stored, parent, self._bases.tile)), tile=notice.tile)
@@ -103,6 +109,7 @@ def update_of(stored: StoredTile, parent: StoredTile | None, read: Read = Stored
         previous_sha=parent.sha if parent else b"",
         reason=stored.kind,
         day=stored.day,
+        made_s=0 if stored.signature is None else stored.signature.made_s,
     )
     return _with_delta(update, stored, parent, read) if parent else update
 

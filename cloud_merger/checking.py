@@ -8,6 +8,7 @@ import numpy as np
 
 from gnd.cloud_merger.errors import BadReport, MergerError
 from gnd.cloud_merger.features.kept import districts_of, square
+from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
@@ -36,6 +37,11 @@ class IngestLimits:
         unit="tiles",
         least=0,
         most=32,
+    )
+    speeds: bool = setting(
+        True,
+        "Whether reports of places that their vehicle cannot have reached (70 m/s) are refused; off only for loads,"
+        " whose vehicles jump from street to street.",
     )
 
     def __post_init__(self) -> None:
@@ -66,6 +72,15 @@ class MapCheck:
         for change in report.tiles:
             check_change(change)
             self._check_place(report.layer, change)
+
+    def check_places(self, layer: str, tiles: Iterable[TileId]) -> None:
+        """Refuse tiles without a map that are far from it, before anything is made of what is said about them.
+
+        Raises:
+            BadReport: with the tile.
+        """
+        for tile in tiles:
+            self._check_reach(layer, tile)
 
     def _check_place(self, layer: str, change: TileChange) -> None:
         place = (layer, change.tile, change.base_sha)
@@ -100,16 +115,20 @@ def check_change(change: TileChange) -> None:
             f"tile {change.tile}: pose known to {change.pose_sigma_m:.3g} m, {change.pose_sigma_rad:.3g} rad only; "
             f"the limits are {_MAX_POSE_SIGMA_M:g} m, {_MAX_POSE_SIGMA_RAD:g} rad"
         )
-    changed = change.changed
-    variance = changed.cov_m2[:, (0, 3, 5)]
+    for gaussians in (change.changed, change.unsure):
+        _check_gaussians(change, gaussians)
+
+
+def _check_gaussians(change: TileChange, gaussians: Gaussians) -> None:
+    variance = gaussians.cov_m2[:, (0, 3, 5)]
     checks = (
-        ("mean of {:.3g} m from the voxel's centre", np.abs(changed.mean_m).max(axis=1, initial=0), _MAX_MEAN_M),
+        ("mean of {:.3g} m from the voxel's centre", np.abs(gaussians.mean_m).max(axis=1, initial=0), _MAX_MEAN_M),
         ("variance of {:.3g} m²", variance.max(axis=1, initial=0), _MAX_VARIANCE_M2),
-        ("{:d} occupied sub-cells", changed.cells, MAX_CELLS),
-        ("{:d} sub-cells more than points", changed.cells.astype(np.int64) - changed.count, 0),
+        ("{:d} occupied sub-cells", gaussians.cells, MAX_CELLS),
+        ("{:d} sub-cells more than points", gaussians.cells.astype(np.int64) - gaussians.count, 0),
     )
     for what, value, limit in checks:
         if (value > limit).any():
             row = int(np.argmax(value))
             shown = what.format(value[row].item())
-            raise BadReport(f"tile {change.tile}, voxel {changed.voxel_id[row]}: {shown}, the limit is {limit:g}")
+            raise BadReport(f"tile {change.tile}, voxel {gaussians.voxel_id[row]}: {shown}, the limit is {limit:g}")

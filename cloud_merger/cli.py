@@ -16,11 +16,14 @@ from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.settings_file import load_settings
 from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import settings_text
+from gnd.tile_store.location import shown
 
 
 @click.command()
 @click.option("--id", "shard_id", help="Name of this shard; each running shard needs its own.  [default: merger-1]")
-@click.option("--store", "store_path", help="File of the store that the shards share.  [default: map.sqlite]")
+@click.option(
+    "--store", "store_path", help="The store that the shards share, a file or a PostgreSQL URL.  [default: map.sqlite]"
+)
 @click.option("--connect", multiple=True, help="Endpoint of a router, tcp/host:port; may be repeated.")
 @click.option("--mode", type=click.Choice(get_args(Mode)), help="How votes are counted.  [default: default]")
 @settings_options
@@ -52,5 +55,5 @@ def merger(
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    click.echo(f"merger {config.shard_id}: store {config.store_path}, mode {config.merge.mode}", err=True)
+    click.echo(f"merger {config.shard_id}: store {shown(config.store_path)}, mode {config.merge.mode}", err=True)
     run_shard(config, stop, None if metrics_port is None else (metrics_host, metrics_port))

@@ -31,7 +31,9 @@ class ShardConfig:
     """One merger shard."""
 
     shard_id: str = setting("merger-1", "Its name among the shards; each running shard needs its own.")
-    store_path: Path = setting(Path("map.sqlite"), "File of the store, which all shards of a machine share.")
+    store_path: str | Path = setting(
+        "map.sqlite", "The store, which all shards share: a file of their machine, or a PostgreSQL URL."
+    )
     connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers.")
     bus_lease_ms: int = setting(0, "How long a silent shard counts as alive; 0: the bus's own.", unit="ms", least=0)
     merge: MergeParameters = setting(MergeParameters, "How statements become changes.")

@@ -10,7 +10,8 @@ A pure function of the merged tile and the reports, as the merge itself: every n
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -41,6 +42,8 @@ localisation, the parked cars and the mount."""
 Who = Report | Witness
 VOUCHED_VOXELS = 12  # so many claims of a vehicle must others share at least before they vouch for the rest
 _NS_PER_S = 1_000_000_000
+_NS_PER_DAY = 86_400 * _NS_PER_S
+_NO_GROUPS: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +86,14 @@ class GatedTile:
     Attributes:
         merged: the tile to publish.
         waiting: what does, sorted by vehicle and reason.
+        alone: by vehicle, voxels that are changed on its word alone, with those that wait for nothing but the day, ...
+        shared: ... and those that are changed on its word and that of others.
     """
 
     merged: MergedTile
     waiting: tuple[Unconfirmed, ...] = ()
+    alone: Mapping[str, int] = field(default_factory=dict)
+    shared: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +114,8 @@ def gate(
     named: frozenset[str] = frozenset(),
     witnesses: Iterable[Witness] = (),
     contradicted: frozenset[str] = frozenset(),
+    over_cap: frozenset[tuple[str, int]] = frozenset(),
+    first_of: Mapping[str, str] = _NO_GROUPS,
 ) -> GatedTile:
     """Take back the changes that wait for confirmation.
 
@@ -122,15 +131,20 @@ def gate(
         named: vehicles whose reports are shifted again and again: what they alone claim always waits, and they are
             never a second witness of themselves or of each other.
         witnesses: whose claims of earlier windows take part in the merge.
-        contradicted: vehicles that others contradict in this tile: what they alone claim waits, however little it is.
+        contradicted: vehicles that others contradict, in this tile or elsewhere: what they alone claim waits, however
+            little it is.
+        over_cap: vehicles, and days of receipt on which they have changed as much alone as one may.
+        first_of: of vehicles that say the same false things who stands for all of them: they are one witness.
     """
     parameters = parameters or ConfirmationParameters()
     by_report = {report.report_id: report for report in reports}
     by_id = {witness.report_id: witness for witness in witnesses} | by_report
-    lonely = _witnesses(merged, by_id, named)
+    lonely, shared = _witnesses(merged, by_id, named, first_of)
+    shared = shared if len(epoch) else {}  # new ground is nobody's loss
     if not lonely:
-        return GatedTile(merged)
+        return GatedTile(merged, shared=shared)
     waits: dict[int, tuple[str, WaitingReason]] = {}
+    alone: dict[str, int] = {}
     isolated = _isolated(epoch, merged, by_report.values(), parameters.together_voxels)
     for vehicle, witness in sorted(lonely.items()):
         seen = seen_of(vehicle, epoch, by_report.values())
@@ -139,15 +153,34 @@ def gate(
             reasons = dict.fromkeys(witness.lonely, "contradicted")
         if vehicle in named:
             reasons = dict.fromkeys(witness.lonely, "named")
+        if len(epoch):
+            alone[vehicle] = len(witness.lonely) - len(reasons)
+            reasons |= _beyond_the_day(vehicle, witness, reasons.keys(), over_cap)
         waits |= {voxel: (vehicle, reason) for voxel, reason in reasons.items()}
     if not waits:
-        return GatedTile(merged)
-    return GatedTile(merged.without(waits), _told(waits, merged, epoch, by_report.values()))
+        return GatedTile(merged, (), alone, shared)
+    return GatedTile(merged.without(waits), _told(waits, merged, epoch, by_report.values()), alone, shared)
 
 
-def _witnesses(merged: MergedTile, by_id: Mapping[str, Who], named: frozenset[str]) -> dict[str, _Witness]:
-    """By vehicle, its part in the changes that won. Named vehicles do not confirm each other either."""
+def _beyond_the_day(
+    vehicle: str, witness: _Witness, waiting: Collection[int], over_cap: frozenset[tuple[str, int]]
+) -> dict[int, WaitingReason]:
+    """Of the claims that nothing else holds back those of days on which the vehicle has changed as much as it may."""
+    days = {day for name, day in over_cap if name == vehicle}
+    if not days:
+        return {}
+    rest = ((voxel, reports) for voxel, reports in witness.lonely.items() if voxel not in waiting)
+    return {voxel: "day" for voxel, reports in rest if {one.received_ns // _NS_PER_DAY for one in reports} <= days}
+
+
+def _witnesses(
+    merged: MergedTile, by_id: Mapping[str, Who], named: frozenset[str], first_of: Mapping[str, str]
+) -> tuple[dict[str, _Witness], Mapping[str, int]]:
+    """By vehicle, its part in the changes that won, of those that claim any alone; and what each claims with others.
+    Named vehicles do not confirm each other either, nor do those of a group.
+    """
     drive = _drives(by_id.values(), CONFIRMATION_SECOND_DRIVE_S, named)
+    drive |= {one: (first_of[who.vehicle], 0) for one, who in by_id.items() if who.vehicle in first_of}
     lonely: dict[str, dict[int, tuple[Who, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
     voxels: dict[tuple[str, ...], list[int]] = defaultdict(list)
@@ -159,7 +192,7 @@ def _witnesses(merged: MergedTile, by_id: Mapping[str, Who], named: frozenset[st
             lonely[min(vehicles)] |= dict.fromkeys(told, tuple(by_id[one] for one in ids))
         else:
             shared.update(dict.fromkeys(vehicles, len(told)))
-    return {vehicle: _Witness(own, shared[vehicle]) for vehicle, own in lonely.items()}
+    return {vehicle: _Witness(own, shared[vehicle]) for vehicle, own in lonely.items()}, dict(shared)
 
 
 def _drives(reports: Iterable[Who], second_drive_s: float, named: frozenset[str]) -> dict[str, tuple[str, int]]:

@@ -9,12 +9,11 @@ where the vehicle does not count (quarantine, shifted poses): that must be known
 import json
 import secrets
 from bisect import bisect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Final, Literal, cast
 
-import apsw
 import zstandard
 from ulid import ULID
 
@@ -27,9 +26,11 @@ from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.features import FeatureReport
-from gnd.tile_store import sqlite_erase as erasing
-from gnd.tile_store.sqlite_erase import StoredRow
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store import sql_erase as erasing
+from gnd.tile_store.connection import SqlConnection
+from gnd.tile_store.marks import renamed
+from gnd.tile_store.sql_erase import StoredRow
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import Basis, ClosedWindow, ReportRow
 
@@ -78,7 +79,7 @@ class Erased:
 
 
 def erase_vehicle(
-    store: SqliteStore, config: ShardConfig, vehicle: str, tell: Tell = lambda *_: None, *, dry_run: bool = False
+    store: SqlStore, config: ShardConfig, vehicle: str, tell: Tell = lambda *_: None, *, dry_run: bool = False
 ) -> Erased:
     """Make all that a store has of a vehicle nobody's; killed on the way, it is simply begun again.
 
@@ -94,7 +95,7 @@ def erase_vehicle(
     """
     alive = sorted(shard.owner for shard in store.shards() if shard.is_alive)
     if alive and not dry_run:
-        raise MergerError(f"{', '.join(alive)} works on {store.path}: end all mergers of the store first")
+        raise MergerError(f"{', '.join(alive)} works on {store.location}: end all mergers of the store first")
     counted_out = store.look(lambda c: erasing.is_counted_out(c, vehicle))
     shared = _invented() if counted_out else ""
     if shared and not dry_run:
@@ -124,11 +125,12 @@ class _Form:
     ids: Mapping[str, str]
     step_ns: int
 
-    def write(self, c: apsw.Connection) -> None:
+    def write(self, c: SqlConnection) -> None:
         place = (self.told.layer, self.told.tile)
         for row in self.rows:
             erasing.put_row(c, row)
         erasing.rename_in_tile(c, *place, self.vehicle, self.name, self.ids)
+        erasing.own_too(c, self.vehicle, self.name)
         for memory in erasing.memories(c, *place):
             erasing.put_memory(c, *place, self.of_memory(memory))
 
@@ -138,7 +140,7 @@ class _Form:
         return _renamed_memory(TileMemory.decode(body), self.vehicle, self.name, self.ids, self.step_ns).encode()
 
 
-def _anonymous(store: SqliteStore, config: ShardConfig, layer: str, tile: TileId, vehicle: str, name: str) -> _Form:
+def _anonymous(store: SqlStore, config: ShardConfig, layer: str, tile: TileId, vehicle: str, name: str) -> _Form:
     """The most anonymous form of a tile from which all its versions can be computed that can be now."""
     rows, all_ids = store.look(
         lambda c: (erasing.rows_of(c, layer, tile, vehicle), erasing.ids_of_tile(c, layer, tile))
@@ -208,7 +210,7 @@ class _Seen:
 
     def __init__(
         self,
-        store: SqliteStore,
+        store: SqlStore,
         rows: Mapping[tuple[str, int], ReportRow],
         vehicle: str,
         name: str,
@@ -234,8 +236,13 @@ class _Seen:
     def provenance(self, *where: Any) -> tuple[str, ...]:
         return tuple(self._ids.get(one, one) for one in self._store.provenance(*where))
 
+    def owners_of(self, vehicles: Iterable[str]) -> dict[str, tuple[tuple[int, str], ...]]:
+        found = self._store.owners_of({self._vehicle if one == self._name else one for one in vehicles})
+        of_it = found.pop(self._vehicle, ())
+        return found | ({self._name: ((0, of_it[0][1]), *of_it[1:])} if of_it else {})
+
     def _named(self, named: frozenset[str]) -> frozenset[str]:
-        return frozenset(erasing.renamed(one, self._vehicle, self._name) for one in named)
+        return frozenset(renamed(one, self._vehicle, self._name) for one in named)
 
 
 def _renamed_memory(memory: TileMemory, vehicle: str, name: str, ids: Mapping[str, str], step_ns: int) -> TileMemory:
@@ -275,7 +282,7 @@ def _renamed_layer(body: bytes, names: Mapping[str, str]) -> bytes:
     return zstandard.ZstdCompressor(level=3).compress(json.dumps(told, separators=(",", ":")).encode())
 
 
-def _rest(c: apsw.Connection, vehicle: str, name: str) -> None:
+def _rest(c: SqlConnection, vehicle: str, name: str) -> None:
     """What is not of one tile's reports; memories of tiles of which retention has removed the reports."""
     for layer, tile, body in erasing.all_memories(c):
         if is_feature_layer(layer):

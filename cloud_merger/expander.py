@@ -18,6 +18,7 @@ from ulid import ULID
 from gnd.cloud_merger.checking import MapCheck
 from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.errors import BadReport, MergerError, NotUnderstood
+from gnd.cloud_merger.expanding import base_versions
 from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.ingest import one_line
 from gnd.cloud_merger.served import ServedCpu
@@ -32,11 +33,13 @@ from gnd.gnd_map.errors import GndError
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.features import FeatureReport
+from gnd.schemas.keys import parse_change_key
 from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
 from gnd.schemas.survey import SurveyReport
-from gnd.tile_store.errors import IdTaken, StoreDamaged, StoreError
+from gnd.tile_store.errors import IdTaken, ImpossiblePlace, StoreDamaged, StoreError
+from gnd.tile_store.places import ReportPlace
 from gnd.tile_store.store import Store
 from gnd.tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
 from gnd.tile_store.values import ReportRow
@@ -83,7 +86,7 @@ class Expander:
         self._short = ShortReports(store, config.merge, config.want, bases or Bases(store))
         self._features = FeatureInbox(store, config.features, config.feature_layer, config.ingest.reach_tiles)
         self._map, self._surveys = MapCheck(store, config.ingest), SurveyInbox(store)
-        self._served = ServedCpu()
+        self.served = ServedCpu()
         self._lock = Lock()
         self._districts: OrderedDict[str, None] = OrderedDict()  # newest last
 
@@ -100,30 +103,33 @@ class Expander:
             StoreError: the store has failed; what was claimed waits for the end of its lease.
         """
         owner, lease_s = self._config.shard_id, self._config.lease_s
-        claims = self._store.claim_uploads(owner, UPLOADS_AT_ONCE, lease_s, self._served.in_turn)
+        claims = self._store.claim_uploads(owner, UPLOADS_AT_ONCE, lease_s, self.served.in_turn)
         for claim in claims:
             before_s = time.thread_time()
-            self._work_on(claim)
-            self._served.spent(claim.upload.vehicle, time.thread_time() - before_s)
+            vehicle = self._work_on(claim)
+            self.served.spent(claim.upload.vehicle or vehicle, time.thread_time() - before_s)
         return len(claims)
 
-    def _work_on(self, claim: UploadClaim) -> None:
+    def _work_on(self, claim: UploadClaim) -> str:
+        """Whose it was, where that was found out."""
         try:
             outcome = self._settled(self._understood(claim))
         except StoreDamaged as error:  # the store's fault, not the upload's: it waits until the page is mended
             _LOG.error("upload %s waits: %s", claim.upload.report_id, error)
             self._store.postpone_upload(claim, DAMAGED_RETRY_S, blameless=True)
-            return
+            return ""
         except StoreError:
             raise
         except Exception as error:  # one upload never stops the others
             _SELDOM.exception("upload %s failed, attempt %d", claim.upload.report_id, claim.attempts)
             if claim.attempts < MAX_ATTEMPTS:
                 self._store.postpone_upload(claim, RETRY_S * claim.attempts)
-                return
+                return ""
             outcome = self._settled(self._set_aside(claim, f"{type(error).__name__}: {error}"))
-        if outcome is not None:
-            self._announce(outcome)
+        if outcome is None:
+            return ""
+        self._announce(outcome)
+        return outcome.vehicle
 
     def _settled(self, outcome: _Outcome) -> _Outcome | None:
         """The outcome as it is durable now; None: nothing was applied."""
@@ -131,6 +137,9 @@ class Expander:
             is_applied = self._store.settle_upload(outcome.settled)
         except IdTaken as taken:
             outcome = self._renamed(outcome, taken)
+            is_applied = self._store.settle_upload(outcome.settled)
+        except ImpossiblePlace as error:
+            outcome = self._refused(outcome.settled.claim, one_line(str(error)), is_impossible=True)
             is_applied = self._store.settle_upload(outcome.settled)
         if not is_applied and outcome.settled.state == "early":  # its flags have come meanwhile
             self._store.postpone_upload(outcome.settled.claim, 0.0)
@@ -169,7 +178,8 @@ class Expander:
         said = decode_upload(claim.upload.body)
         if isinstance(said, FeatureReport):
             self._features.check(claim.upload.key, said)
-            return self._released(claim, tuple(self._features.rows(said, claim.upload.received_ns)))
+            rows = tuple(self._features.rows(said, claim.upload.received_ns))
+            return self._released(claim, rows, self._place_of(said))
         if isinstance(said, SurveyReport):
             self._surveys.keep(claim.upload.key, said, claim.upload.received_ns)
             return self._released(claim, ())
@@ -178,9 +188,12 @@ class Expander:
         if isinstance(said, PackedReport):
             return self._first_half(claim, said)
         self._map.check(said)
-        return self._released(claim, self._rows_of_whole(claim, said))
+        return self._released(claim, self._rows_of_whole(claim, said), self._place_of(said))
 
     def _first_half(self, claim: UploadClaim, packed: PackedReport) -> _Outcome:
+        layer, district = parse_change_key(claim.upload.key)
+        new = (tile for tile, version in base_versions(packed, district) if not version)
+        self._map.check_places(layer, new)  # it costs little, what follows does not
         report = self._short.expanded(claim.upload.key, packed)
         self._map.check(report)
         first = self._short.decided(report)
@@ -190,8 +203,8 @@ class Expander:
             for row in rows_of(report, claim.upload.received_ns)
         )
         if not first.wanted:
-            return self._released(claim, rows)
-        return self._told(Settled(claim, "wanted", rows, first.wanted), asks=first)
+            return self._released(claim, rows, self._place_of(report))
+        return self._told(Settled(claim, "wanted", rows, first.wanted, place=self._place_of(report)), asks=first)
 
     def _second_half(self, claim: UploadClaim, gaussians: PackedGaussians) -> _Outcome:
         """Gaussians belong to those flags of their id and key that have asked for them."""
@@ -241,13 +254,18 @@ class Expander:
         _SELDOM.warning("%s; kept as %s", taken, rows[0].report_id)
         return replace(outcome, settled=replace(settled, rows=rows))
 
-    def _released(self, claim: UploadClaim, rows: tuple[ReportRow, ...]) -> _Outcome:
-        return self._told(Settled(claim, "released", rows))
+    def _place_of(self, report: ChangeReport | FeatureReport) -> ReportPlace | None:
+        """Where its vehicle was, if that is looked at."""
+        tiles = [one.tile for one in report.tiles] if self._config.ingest.speeds else []
+        return ReportPlace.of(report.report_id, report.last_ns, tiles) if tiles else None
 
-    def _refused(self, claim: UploadClaim, reason: str) -> _Outcome:
-        counted("upload", "refused")
+    def _released(self, claim: UploadClaim, rows: tuple[ReportRow, ...], place: ReportPlace | None = None) -> _Outcome:
+        return self._told(Settled(claim, "released", rows, place=place))
+
+    def _refused(self, claim: UploadClaim, reason: str, *, is_impossible: bool = False) -> _Outcome:
+        counted("upload", "impossible" if is_impossible else "refused")
         _SELDOM.warning("quarantined %s of report %s: %s", claim.upload.form, claim.upload.report_id, reason)
-        return self._told(Settled(claim, "quarantined", reason=reason))
+        return self._told(Settled(claim, "quarantined", reason=reason, is_impossible=is_impossible))
 
     def _set_aside(self, claim: UploadClaim, why: str) -> _Outcome:
         return self._refused(claim, one_line(f"set aside after {claim.attempts} attempts to read it: {why}"))
@@ -265,7 +283,7 @@ def rows_of(report: ChangeReport, received_ns: int, part: int = 0) -> tuple[Repo
     return tuple(
         ReportRow(
             report.report_id, report.layer, tile, report.vehicle, received_ns, body, change.base_sha, part,
-            is_quiet=not len(change.changed),
+            is_quiet=not len(change.changed) and not len(change.unsure),
         )
         for change, (tile, body) in zip(report.tiles, encoded_parts(report), strict=True)
     )  # fmt: skip

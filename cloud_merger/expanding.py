@@ -64,6 +64,7 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
         _check_way(packed.report_id, track)
         flags = decode_flags([(tile.tile_id, tile.gaussians) for tile in bases], packed.flags)
         _check_flags(packed.report_id, flags)
+        unsure = _unsure(packed, bases, flags)
         observed = observed_along(track, flags)
     except (CodecError, ConfigError, ShapeError, TrackError) as error:
         raise BadReport(f"report {packed.report_id} in {len(packed.flags)} bytes of flags: {error}") from error
@@ -76,12 +77,30 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
         first_ns=packed.first_ns,
         last_ns=packed.last_ns,
         tiles=tuple(
-            _change(packed, tile, sha, one, observed[tile.tile_id])
-            for tile, sha, one in zip(bases, shas, flags, strict=True)
+            _change(packed, tile, sha, one, observed[tile.tile_id], not_sure)
+            for tile, sha, one, not_sure in zip(bases, shas, flags, unsure, strict=True)
         ),
         layer=layer,
         course=packed.course,
     )
+
+
+def _unsure(packed: PackedReport, bases: Sequence[Tile], flags: Sequence[Flags]) -> list[Gaussians]:
+    """Of each tile what the vehicle met and does not decide upon."""
+    if not packed.unsure:
+        return [Gaussians.empty()] * len(bases)
+    told = decode_flags([(tile.tile_id, tile.gaussians) for tile in bases], packed.unsure)
+    _check_flags(packed.report_id, told)
+    for one, flagged in zip(told, flags, strict=True):
+        n = int((one.change_class != ChangeClass.NEW).sum() + are_in(one.voxel_id, flagged.voxel_id).sum())
+        if n:
+            raise BadReport(
+                f"report {packed.report_id}: {n} voxels of tile {one.tile_id} are unsure and flagged or held"
+            )
+    some = [one for one in told if len(one.voxel_id)]
+    met = decode_measured([(one.tile_id, one.base, one.voxel_id) for one in some], packed.unsure_measured)
+    by_tile = {one.tile_id: measured for one, measured in zip(some, met, strict=True)}
+    return [by_tile.get(tile.tile_id, Gaussians.empty()) for tile in bases]
 
 
 def _check_way(report_id: str, track: Track) -> None:
@@ -117,19 +136,22 @@ def _ends(flags: Flags) -> list[int]:
     return [(voxel_id + grid.nx * grid.ny // 2) // (grid.nx * grid.ny) for voxel_id in ends]
 
 
-def _change(packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed: NDArray[np.int32]) -> TileChange:
+def _change(
+    packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed: NDArray[np.int32], unsure: Gaussians
+) -> TileChange:
     n = len(flags.voxel_id)
     return TileChange(
         tile=base.tile_id,
         base_version=base.version,
         base_sha=sha,
-        observed=observed,
+        observed=observed[~are_in(observed, unsure.voxel_id)] if len(unsure) else observed,
         changed=_nothing_at(flags.voxel_id),
         change_class=flags.change_class,
         evidence=np.zeros((n, 4), np.int32),
         pose_sigma_m=packed.pose_sigma_m,
         pose_sigma_rad=packed.pose_sigma_rad,
         doubt=packed.doubt_of(base.tile_id.morton % limits.MAX_TILES_OF_DISTRICT),
+        unsure=unsure,
     )
 
 

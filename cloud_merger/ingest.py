@@ -59,18 +59,20 @@ class Ingest:
             StoreError: it could not be kept; the vehicle is to send it again.
             Busy: more than is admitted; the vehicle is to send it later.
         """
-        received_ns, report_id = self._now_ns(), ""
+        received_ns, report_id, patient_s = self._now_ns(), "", 0.0
         try:
             head = head_of_upload(payload)
             report_id = head.report_id
             check_head(key, head, received_ns)
             self._check_asker(head, asker)
             if self._admission is not None:
-                self._admission.admit(key, head, len(payload))
+                patient_s = self._admission.admit(key, head, len(payload))
         except (SchemaError, BadReport) as error:
             return self._refuse(key, payload, report_id, error)
+        if asker is not None and asker.owner and head.vehicle:
+            self._store.note_owner(head.vehicle, asker.owner, received_ns)
         upload = Upload(key, payload, report_id, head.vehicle, head.form, received_ns)
-        status = self._store.put_upload(upload, self._home)
+        status = self._store.put_upload(upload, self._home, patient_s)
         if status == "stored":
             self._on_stored()
         return ChangeAck(report_id, status)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from hashlib import sha256
 from typing import Any, Final
 
+from gnd.cloud_merger.caps import CAP_MODEL_BEYOND, CAP_MODEL_VOICES, CAP_OWNER_BEYOND, CAP_OWNER_VOICES
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.confirmation import (
     CONFIRMATION_SECOND_DRIVE_S,
@@ -22,6 +23,12 @@ from gnd.cloud_merger.features.existence import FEATURE_ABSENCE, FEATURE_CEILING
 from gnd.cloud_merger.features.parameters import FEATURE_GATE, FeatureMergeParameters
 from gnd.cloud_merger.features.publication import FEATURE_MOST_WEIGHT, FEATURE_RENEWAL_MASS, FEATURE_VOTERS
 from gnd.cloud_merger.features.tracks import FEATURE_MAX_BEGUN, FEATURE_MOVED_M
+from gnd.cloud_merger.hearing import (
+    HEARD_LEAST_OTHERS,
+    HEARD_LEAST_VOXELS,
+    HEARD_MISSED,
+    HEARD_WRONG_CLAIMS,
+)
 from gnd.cloud_merger.parameters import (
     MERGE_D_DENIED,
     MERGE_D_RENEWED,
@@ -77,6 +84,16 @@ _CONSTANTS: Final[dict[str, dict[str, float]]] = {
         "well_known_m": CONFIRMATION_WELL_KNOWN_M,
         "second_drive_s": CONFIRMATION_SECOND_DRIVE_S,
     },
+    "hearing": {
+        "cap_model_beyond": CAP_MODEL_BEYOND,
+        "cap_model_voices": CAP_MODEL_VOICES,
+        "cap_owner_beyond": CAP_OWNER_BEYOND,
+        "cap_owner_voices": CAP_OWNER_VOICES,
+        "least_others": HEARD_LEAST_OTHERS,
+        "least_voxels": HEARD_LEAST_VOXELS,
+        "missed": float(HEARD_MISSED),
+        "wrong_claims": float(HEARD_WRONG_CLAIMS),
+    },
     "parked": {
         "most_h": PARKED_MOST_H,
         "place_goings": PARKED_PLACE_GOINGS,
@@ -121,6 +138,11 @@ def text_of(config: ShardConfig) -> str:
     if config.feature_layer:
         said["feature_layer"] = [to_mapping(layer) for layer in config.feature_layer]
     return json.dumps(said | {"codec": config.codec, "format": _FORMAT}, sort_keys=True, separators=(",", ":"))
+
+
+def has_hearing(text: str) -> bool:
+    """Whether a text is of rules by which who is clearly wrong in a tile has no vote there; "" is of older ones."""
+    return bool(text) and "hearing" in json_value(text)
 
 
 def digest_of(text: str) -> str:

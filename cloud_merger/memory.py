@@ -124,7 +124,8 @@ class TileMemory:
             own = [k for k, one in enumerate(self.witnesses) if one.vehicle == vehicle]
             if own:
                 speaks = [one for one in reports if one.vehicle == vehicle]
-                again = np.isin(self.claims["voxel_id"], np.concatenate([one.change.observed for one in speaks]))
+                spoken_of = [ids for one in speaks for ids in (one.change.observed, one.change.unsure.voxel_id)]
+                again = np.isin(self.claims["voxel_id"], np.concatenate(spoken_of))
                 again &= np.isin(self.claims["report"], own)
                 at = np.flatnonzero(again)  # by voxel, the newest last
                 voxel = self.claims["voxel_id"][at]

@@ -23,7 +23,7 @@ from gnd.cloud_merger.stored import Bases
 from gnd.cloud_merger.survey.mapper import RoadMapper
 from gnd.cloud_merger.warm import warm_up
 from gnd.cloud_merger.work import Worker, in_turn
-from gnd.cloud_merger.worker_process import Address, worker_process
+from gnd.cloud_merger.worker_process import Address, Tell, worker_process
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.certificate_metrics import certificate_checks, register_certificate
 from gnd.fleet_bus.config import BusConfig
@@ -31,8 +31,9 @@ from gnd.fleet_bus.health import HealthServer
 from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.refusals import RefusalsTold, show_refusals
 from gnd.tile_store.errors import StoreClosed, StoreError
+from gnd.tile_store.location import open_store
 from gnd.tile_store.metrics import store_checks
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.signing import Signing
 from gnd.tile_store.values import Claim
 
 __all__ = ["ShardConfig", "run_shard", "run_worker"]
@@ -64,20 +65,21 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
     """
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms, patient=True)
     with (
-        SqliteStore(config.store_path, config.store, create=False) as store,
+        open_store(config.store_path, config.store, create=False) as store,
         open_bus(bus_config, name=config.shard_id) as bus,
     ):
         store.release(config.shard_id)  # leases of an earlier life
-        with worker_process(config, metrics_at) as worker:
+        states = States(store, bus)
+        with worker_process(config, states.tell, metrics_at) as worker:
             admission = Admission(store)
             # look at the outside, keep the bytes
             ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission)
             members = Members(config.shard_id)
             follow_revoked(bus)
-            States(store, bus).open()
+            states.open()
             reception = Reception(bus, members, ingest.answer, store.release, KnownShards(store).has)
             reception.open()
-            _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
+            _LOG.info("merger %s: store %s, mode %s", config.shard_id, store.location, config.merge.mode)
             told = RefusalsTold(_LOG)
             while not stop.wait(config.poll_s):
                 reception.look_again()
@@ -89,19 +91,27 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
 
 
 def run_worker(
-    config: ShardConfig, stop: threading.Event, arrived: threading.Event, metrics_at: Address | None = None
+    config: ShardConfig,
+    stop: threading.Event,
+    arrived: threading.Event,
+    tell: Tell,
+    metrics_at: Address | None = None,
 ) -> None:
     """Expand, merge and announce until `stop` is set; `arrived` is set when something has come.
+
+    `tell` is called with a vehicle and how far its report has come, in any thread.
 
     A store that fails (a full disk, another process that holds it for too long) is tried again until it works.
 
     Raises:
         StoreError: the store cannot be opened.
+        IdentityError: the identity of this process is no shard's.
     """
+    signing = Signing.of_environment()
     warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms, patient=True)
     with (
-        SqliteStore(config.store_path, config.store, create=False) as store,
+        open_store(config.store_path, config.store, create=False, signing=signing) as store,
         open_bus(bus_config, name=f"{config.shard_id}-worker") as bus,
         Leases(store, config.shard_id, config.lease_s) as leases,
         ExitStack() as stack,
@@ -119,8 +129,9 @@ def run_worker(
         bases = Bases(store)  # what one has decoded or made, the others need next
         # tiles that wait for longer than the pause between two looks are found in time without being woken for
         on_journaled = wake.set if config.store.merge_delay_s <= config.poll_s else lambda: None
-        expander = Expander(store, config, States(store, bus).tell, on_journaled=on_journaled, bases=bases)
+        expander = Expander(store, config, tell, on_journaled=on_journaled, bases=bases)
         stack.enter_context(working(expander.work, arrived, _EXPANDERS, config.poll_s))
+        metrics.show_served(expander.served)
         roads = RoadMapper(store, config.shard_id, on_published=wake.set, codec=config.codec)
         stack.enter_context(working(roads.work, threading.Event(), 1, ROADS_EVERY_S))  # surveys -> new roads
 

@@ -3,9 +3,11 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
+from gnd.cloud_merger.served import ServedCpu
 from gnd.tile_store.values import PublishResult
 
 MERGE_BUCKETS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
@@ -31,6 +33,18 @@ class ShardMetrics:
         self._failures = Counter(
             "gnd_store_failures", "How often the store could not do what was asked.", registry=self.registry
         )
+
+    def show_served(self, served: ServedCpu) -> None:
+        """Shows the CPU that went into uploads, and how many vehicles wait because of it."""
+        held = Gauge(
+            "gnd_vehicles_held_back", "Vehicles whose uploads wait: beyond their share of CPU.", registry=self.registry
+        )
+        held.set_function(lambda: served.held_back)
+        seconds = Gauge(
+            "gnd_upload_cpu_seconds", "CPU that went into uploads, by whose.", ["whose"], registry=self.registry
+        )
+        for whose in served.spent_s:
+            seconds.labels(whose).set_function(partial(served.spent_s.__getitem__, whose))
 
     @contextmanager
     def merging(self, tiles: int) -> Iterator[None]:

@@ -89,4 +89,4 @@ class MergeParameters:
         """Return a report's part about one tile with the weight of its votes, by sensor and poses."""
         pose_m2, half_m2 = self.pose_m2_of(change), self.pose_weight_m**2
         share = half_m2 / (half_m2 + pose_m2) if half_m2 > 0.0 else 1.0
-        return Report(report_id, change, self.weight_of(sensor_model) * share, pose_m2)
+        return Report(report_id, change, self.weight_of(sensor_model) * share, pose_m2, model=sensor_model)

@@ -150,8 +150,9 @@ class _Spoken:
         there = ids[changed.speaks & (changed.rows["kind"] != Kind.NOTHING)]
         unchanged = report.change.observed[~are_in(report.change.observed, ids)]
         base = bases.get(report.change.base_sha, Gaussians.empty()).voxel_id
-        observed = unique(np.concatenate([unchanged, ids[changed.speaks]]))
-        there = unique(np.concatenate([there, unchanged[are_in(unchanged, base)]]))
+        met = report.change.unsure.voxel_id
+        observed = unique(np.concatenate([unchanged, ids[changed.speaks], met]))
+        there = unique(np.concatenate([there, unchanged[are_in(unchanged, base)], met]))
         return cls(report.last_ns, report.weight >= PARKED_FREE_WEIGHT, observed, there)
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.cloud_merger.together import met_together
 from gnd.gnd_map.accumulate import N_MIN_CELLS
 from gnd.gnd_map.arrays import unique
 from gnd.gnd_map.by_object import ByObject
@@ -87,6 +88,7 @@ class Report:
         is_doubtful: the vehicle does not fully believe it; the merge does not look at this.
         course: where the vehicle drives in its own frame, None where it does not know.
         received_ns: when it came, by the clock of the cloud.
+        model: of its LiDAR.
     """
 
     report_id: str
@@ -99,6 +101,7 @@ class Report:
     is_doubtful: bool = False
     course: Course | None = None
     received_ns: int = 0
+    model: str = ""
 
     @property
     def turn(self) -> tuple[int, int, str]:
@@ -160,11 +163,12 @@ def statements_of(
     ordered = sorted({report.report_id: report for report in reports}.values(), key=lambda r: r.report_id)
     known = {} if mode == "paper" else {NO_BASE: Gaussians.empty(), **bases}
     claims = np.zeros(0, STATEMENT) if memory is None else memory.claims_beside(ordered)
+    met = _met(epoch, ordered) if mode == "default" else np.zeros(0, STATEMENT)
     voxels = _disputed(epoch, ordered, known)
-    if len(claims):
-        voxels = unique(np.concatenate([voxels, claims["voxel_id"]]))
+    if len(claims) + len(met):
+        voxels = unique(np.concatenate([voxels, claims["voxel_id"], met["voxel_id"]]))
     quoted = _numbered_states(voxels, epoch, known)
-    rows = _one_vote_a_vehicle(_spoken(voxels, ordered, quoted), ordered)
+    rows = _one_vote_a_vehicle(_with(met, _spoken(voxels, ordered, quoted)), ordered)
     if memory is not None and len(memory.voxels) + len(claims):
         claims = claims.copy()
         claims["report"] += len(ordered)
@@ -174,17 +178,62 @@ def statements_of(
     return Statements(tuple(ordered), rows, () if memory is None else memory.witnesses)
 
 
+def _met(epoch: Gaussians, reports: Sequence[Report]) -> Rows:
+    """STATEMENT rows of reports about voxels that they are unsure of and that all together decide: no claims, for no
+    vehicle has made them.
+    """
+    if not any(len(one.change.unsure) for one in reports):
+        return np.zeros(0, STATEMENT)
+    found = met_together(
+        epoch, [one.change.unsure for one in reports], [_called_new(one) for one in reports], *_voters(reports)
+    )
+    rows = np.zeros(len(found.voxel_id), STATEMENT)
+    rows["voxel_id"], rows["report"], rows["kind"] = found.voxel_id, found.report, Kind.MEASURED
+    rows["weight"] = np.array([one.weight for one in reports])[found.report]
+    rows["pose_m2"] = np.array([one.pose_m2 for one in reports])[found.report]
+    rows["count"] = rows["cells"] = N_MIN_CELLS
+    rows["mean_m"], rows["cov_m2"] = found.mean_m, found.cov_m2
+    return rows
+
+
+def _called_new(report: Report) -> NDArray[np.int32]:
+    told = changed_of(report.change)
+    there = told.speaks & (told.rows["kind"] != Kind.NOTHING) & (report.change.change_class == ChangeClass.NEW)
+    ids: NDArray[np.int32] = report.change.changed.voxel_id[there]
+    return ids
+
+
+def _with(met: Rows, rows: Rows) -> Rows:
+    """Both, by voxel, then by report."""
+    if not len(met):
+        return rows
+    both = stacked([rows, met])
+    return both[np.lexsort((both["report"], both["voxel_id"]))]
+
+
+def is_met(rows: Rows) -> NDArray[np.bool_]:
+    """(M,) which statements of a window's reports are about what no vehicle decides upon alone."""
+    return np.asarray((rows["kind"] == Kind.MEASURED) & ~rows["claim"])
+
+
+def _voters(reports: Sequence[Report]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(R,) number of each report's vehicle, of one without a name its own, and (R,) its place in time."""
+    number = {vehicle: k for k, vehicle in enumerate(sorted({one.vehicle for one in reports if one.vehicle}))}
+    vehicle = np.array([number.get(one.vehicle, len(number) + k) for k, one in enumerate(reports)], np.int64)
+    turn = np.empty(len(reports), np.int64)
+    turn[sorted(range(len(reports)), key=lambda k: reports[k].turn)] = np.arange(len(reports))
+    return vehicle, turn
+
+
 def _one_vote_a_vehicle(rows: Rows, reports: Sequence[Report]) -> Rows:
     """Of several statements of a vehicle about one voxel only the newest; where that withholds its Gaussian, the newest
     that measured one against the same state instead: it says the same, and more.
     """
-    number = {vehicle: k for k, vehicle in enumerate(sorted({one.vehicle for one in reports if one.vehicle}))}
-    if len(number) == len(reports) or not len(rows):
+    vehicles = {one.vehicle for one in reports if one.vehicle}
+    if len(vehicles) == len(reports) or not len(rows):
         return rows
-    vehicle = np.array([number.get(one.vehicle, len(number) + k) for k, one in enumerate(reports)], np.int64)
-    turn = np.empty(len(reports), np.int64)
-    turn[sorted(range(len(reports)), key=lambda k: reports[k].turn)] = np.arange(len(reports))
-    voter = rows["voxel_id"].astype(np.int64) * (len(number) + len(reports)) + vehicle[rows["report"]]
+    vehicle, turn = _voters(reports)
+    voter = rows["voxel_id"].astype(np.int64) * (len(vehicles) + len(reports)) + vehicle[rows["report"]]
     order = np.lexsort((turn[rows["report"]], voter))
     last = np.append(voter[order][1:] != voter[order][:-1], True)
     group = np.cumsum(last) - last

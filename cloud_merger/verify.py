@@ -9,7 +9,7 @@ from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.kept import FeatureContents
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, refuted_of, windows_of
-from gnd.cloud_merger.map_parameters import digest_of, text_of, with_text
+from gnd.cloud_merger.map_parameters import digest_of, has_hearing, text_of, with_text
 from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.statements import Report
 from gnd.cloud_merger.stored import Bases, lattice_of_tile, reports_by_window
@@ -206,6 +206,7 @@ class Verifier:
         shas = {row.base_sha for row in journal.rows if row.base_sha}
         found = {sha: self._bases.content(layer, tile, sha) for sha in sorted(shas)}
         bases = {sha: gaussians for sha, gaussians in found.items() if gaussians is not None}
+        owners = self._store.owners_of({row.vehicle for row in journal.rows})
 
         def said(window: int) -> list[Report]:
             rows = [row for row in journal.rows if row.window == window]
@@ -215,7 +216,10 @@ class Verifier:
         def merged(window: int, reports: Sequence[Report]) -> MergedWindow:
             how = journal.how(window)
             config, shifts = self._with(how.parameters)
-            merger = WindowMerger(config.merge, config.confirmation, shifts, bases, how.named)
+            hears = has_hearing(how.parameters)
+            merger = WindowMerger(
+                config.merge, config.confirmation, shifts, bases, how.named, has_hearing=hears, owners=owners
+            )
             return merger.merge(state, reports, lattice_of_tile(begun, epoch, config.codec))
 
         for window in journal.windows_before:

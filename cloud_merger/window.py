@@ -5,7 +5,7 @@ of shards end in the same map, bit for bit, and `gnd.cloud_merger.verify` comput
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 
 from gnd.cloud_merger.agreement import Agreement, agreement_of
 from gnd.cloud_merger.belief import Believed, ShiftTests, believed
+from gnd.cloud_merger.caps import Owners, capped
 from gnd.cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate
+from gnd.cloud_merger.groups import as_one, coincidences_of, owned_as_one
+from gnd.cloud_merger.hearing import Hearing, Spoken, all_heard, heard, spoken_of, without_silent
 from gnd.cloud_merger.memory import (
     ANOTHER_DRIVE_S,
     CLAIMS_OF_VEHICLE,
@@ -28,11 +31,12 @@ from gnd.cloud_merger.merge import MergedTile, MergeParameters, merge_tile
 from gnd.cloud_merger.parked import hold_parked, parked_after
 from gnd.cloud_merger.season import hold_season
 from gnd.cloud_merger.snapping import Snapping
-from gnd.cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness, find, statements_of
+from gnd.cloud_merger.statements import EPOCH, Kind, Report, Rows, Statements, Witness, find, is_met, statements_of
 from gnd.gnd_map.codec import Lattice, snap
 from gnd.gnd_map.day import day_of
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.tile_store.values import QUARANTINED, AgreementTest
+from gnd.tile_store.marks import Marked
+from gnd.tile_store.values import AgreementTest, Coincidence, VehicleStanding
 
 I32 = NDArray[np.int32]
 
@@ -40,6 +44,7 @@ MOST_CLAIMS: Final = 20_000
 """Of a tile; the newest stay."""
 _DENSE: Final = 8_000_000
 _NS_PER_S: Final = 1_000_000_000
+_NS_PER_DAY: Final = 86_400 * _NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,15 +60,21 @@ class MergedWindow:
     """What a window gives.
 
     Attributes:
-        believed: its reports, sorted out.
+        reports: of the window.
+        believed: those, sorted out.
         agreement: how each agrees with the others, whoever is believed.
         statements: of those that are believed, and of the memory.
         gated: the tile as it may be published, and what waits.
         gaussians: of that tile, on its lattice.
         parked: what has the shape of a vehicle and is held back.
         bases: Gaussians of the versions that the reports refer to, by content hash.
+        denied: of each vehicle its claims that somebody else has seen, too, and how many of them are denied.
+        coincidences: how far the claims of refuted reports coincide.
+        unheard: vehicles, once for each kind of statement of theirs that does not count.
+        carries_quotes: whether "as in an older version" is remembered as a claim; it was not by the rules of before.
     """
 
+    reports: tuple[Report, ...]
     believed: Believed
     statements: Statements
     gated: GatedTile
@@ -71,6 +82,40 @@ class MergedWindow:
     parked: ParkedVoxels
     bases: Mapping[bytes, Gaussians]
     agreement: tuple[AgreementTest, ...] = ()
+    carries_quotes: bool = True
+    denied: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    coincidences: tuple[Coincidence, ...] = ()
+    unheard: tuple[str, ...] = ()
+
+    def standings(self, window: int) -> tuple[VehicleStanding, ...]:
+        """How the vehicles stand in it of which there is anything to tell."""
+        newest: dict[str, Report] = {}
+        for report in sorted(self.reports, key=lambda one: one.turn):
+            if report.vehicle:
+                newest[report.vehicle] = report
+        found = []
+        for vehicle, one in sorted(newest.items()):
+            alone, shared = self.gated.alone.get(vehicle, 0), self.gated.shared.get(vehicle, 0)
+            judged, denied = self.denied.get(vehicle, (0, 0))
+            unheard = self.unheard.count(vehicle)
+            if alone or shared or judged or unheard:
+                day = one.received_ns // _NS_PER_DAY
+                found.append(VehicleStanding(vehicle, window, one.last_ns, day, alone, shared, judged, denied, unheard))
+        return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """What reports say: their statements without and with caps, what all of those decide, who is heard, and whose the
+    vehicles are.
+    """
+
+    uncapped: Statements
+    statements: Statements
+    merged: MergedTile
+    spoken: Spoken
+    heard: Hearing
+    owners: Owners
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,9 +127,10 @@ class WindowMerger:
         confirmation: what a single vehicle may change.
         shifts: tests of reports, each made once.
         bases: Gaussians by content hash of the versions that the reports refer to.
-        named: vehicles whose reports are shifted again and again; with `QUARANTINED` before them those whose reports do
-            not count.
+        named: words about vehicles that do not count, are not believed alone, or have one vote with others (`Marked`).
         snapping: what the last merges have given, on their lattices.
+        has_hearing: whether who is clearly wrong in a tile loses its vote there; versions of before were made without.
+        owners: of vehicles, where their certificates tell them.
     """
 
     rules: MergeParameters
@@ -93,15 +139,17 @@ class WindowMerger:
     bases: Mapping[bytes, Gaussians]
     named: frozenset[str]
     snapping: Snapping = field(default_factory=Snapping)
+    has_hearing: bool = True
+    owners: Owners = field(default_factory=dict)
 
     def merge(self, state: TileState, reports: Sequence[Report], lattice: Lattice | None) -> MergedWindow:
         """Merge the reports of a window, in any order, into what the windows before it have come to.
 
         `lattice`: on which the tile lies; None: none.
         """
-        rules, agreement = self.rules, Agreement()
-        out = frozenset(name.removeprefix(QUARANTINED) for name in self.named if name.startswith(QUARANTINED))
-        named = frozenset(name for name in self.named if not name.startswith(QUARANTINED))
+        rules, agreement, marked = self.rules, Agreement(), Marked.of(self.named)
+        unheard: tuple[str, ...] = ()
+        out, named = marked.counted_out, marked.shifted
         if rules.has_paper_rules:  # they know neither shift tests nor a gate nor a memory
             in_play = Believed(tuple(reports), (), ())
             statements = statements_of(state.gaussians, reports, self.bases, rules.mode)
@@ -109,22 +157,48 @@ class WindowMerger:
         else:
             shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
             in_play = believed(reports, shifts, named)
-            statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
-            merged = merge_tile(state.gaussians, statements, rules)
-            agreement = agreement_of(state.gaussians, statements, merged.for_epoch)
-            if out & {one.vehicle for one in in_play.reports}:
+            told = self._told(state, in_play)
+            agreement = agreement_of(state.gaussians, told.statements, told.spoken, told.heard)
+            is_less = bool(out & {one.vehicle for one in in_play.reports})
+            if is_less or self._is_of_groups(state, in_play.reports, marked):
                 in_play = in_play.without(out)
-                statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
+                told = self._told(state, in_play, marked.first_of)  # who is refuted does not depend on groups
+            statements, merged = told.statements, told.merged
+            unheard = tuple(name for name, _ in told.heard.silent)
+            if told.heard.silent:
+                statements = capped(without_silent(told.uncapped, told.heard), told.owners)
                 merged = merge_tile(state.gaussians, statements, rules)
             by, seen = statements.witnesses, in_play.reports
             standing = state.memory.parked, self.bases, self.confirmation.parked_h
             bare, leaves = hold_season(state.gaussians, merged, seen)
             free = hold_parked(state.gaussians, bare, seen, *standing)
-            found = gate(state.gaussians, free.merged, seen, self.confirmation, named, by, agreement.contradicted)
-            gated = GatedTile(found.merged, (*found.waiting, *free.waiting, *leaves, *in_play.set_aside))
+            alone = agreement.contradicted | marked.contradicted
+            more = named, by, alone, marked.over_cap, marked.first_of
+            found = gate(state.gaussians, free.merged, seen, self.confirmation, *more)
+            waiting = (*found.waiting, *free.waiting, *leaves, *in_play.set_aside)
+            gated = GatedTile(found.merged, waiting, found.alone, found.shared)
             parked = free.voxels
         gaussians = self._on_lattice(gated.merged, reports, lattice)
-        return MergedWindow(in_play, statements, gated, gaussians, parked, self.bases, agreement.tests)
+        return MergedWindow(
+            tuple(reports), in_play, statements, gated, gaussians, parked, self.bases, agreement.tests,
+            self.has_hearing, agreement.denied, coincidences_of(reports, agreement.tests), unheard,
+        )  # fmt: skip
+
+    def _is_of_groups(self, state: TileState, reports: Sequence[Report], marked: Marked) -> bool:
+        """Whether vehicles of a group speak here, now or in what is remembered."""
+        voters: list[Report | Witness] = [*reports, *state.memory.witnesses]
+        return any(one.vehicle in marked.first_of for one in voters)
+
+    def _told(self, state: TileState, in_play: Believed, first_of: Mapping[str, str] | None = None) -> "_Told":
+        """What the reports in play say, and who of them is heard; `first_of`: of each vehicle of a group its first."""
+        owners = owned_as_one(self.owners, first_of or {})
+        uncapped = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
+        uncapped = as_one(uncapped, first_of or {})
+        statements = capped(uncapped, owners) if self.has_hearing else uncapped
+        merged = merge_tile(state.gaussians, statements, self.rules)
+        spoken = spoken_of(state.gaussians, statements, merged.for_epoch, owners, self.has_hearing)
+        found = heard(state.gaussians, statements, spoken) if self.has_hearing else all_heard(statements)
+        return _Told(uncapped, statements, merged, spoken, found, owners)
 
     def _on_lattice(self, merged: MergedTile, reports: Sequence[Report], lattice: Lattice | None) -> Gaussians:
         if lattice is None:
@@ -153,10 +227,23 @@ def fold(state: TileState, window: MergedWindow) -> TileState:
     n = len(window.statements.reports)
     fresh = np.array([state.memory.is_fresh(one) for one in window.statements.reports] + [False], bool)
     is_fresh = np.append(fresh[:n], False)[np.where((rows["report"] >= 0) & (rows["report"] < n), rows["report"], n)]
-    claims, witnesses = _claims_left(window.statements, agrees, is_fresh & agrees, is_changed)
+    statements = _with_older_quotes(window.statements, state.gaussians) if window.carries_quotes else window.statements
+    claims, witnesses = _claims_left(statements, agrees, is_fresh & agrees, is_changed)
     voxels = _observed(state.memory, window, merged.changed, agrees)
     parked = parked_after(state.memory.parked, window.parked, window.gaussians.voxel_id, reports, window.bases)
     return TileState(window.gaussians, TileMemory(voxels, claims, witnesses, _voters(state.memory, reports), parked))
+
+
+def _with_older_quotes(statements: Statements, epoch: Gaussians) -> Statements:
+    """The same, with what is said "as in an older version" as a claim where the tile holds something else now: who has
+    an old map and still finds it true denies the newest version as much as who has that and finds it false.
+    """
+    rows = statements.rows.copy()
+    nothing = (rows["kind"] == Kind.NOTHING) & (find(epoch.voxel_id, rows["voxel_id"]) >= 0)
+    held = (rows["kind"] == Kind.QUOTED) & (rows["was"] != EPOCH)
+    rows["claim"] |= (rows["report"] >= 0) & (nothing | held)
+    rows["kind"][held & (rows["report"] >= 0)] = Kind.MEASURED
+    return replace(statements, rows=rows)
 
 
 def _claims_left(
@@ -164,7 +251,7 @@ def _claims_left(
 ) -> tuple[Rows, tuple[Witness, ...]]:
     """Claims against what the tile holds now, of each voxel the newest: each confirmation takes the oldest away."""
     rows, who = statements.rows, _voters_of(statements)
-    at = np.flatnonzero(rows["claim"] & ~agrees & (rows["report"] >= 0))
+    at = np.flatnonzero((rows["claim"] | is_met(rows)) & ~agrees & (rows["report"] >= 0))
     if not len(at):
         return rows[:0], ()
     order = sorted(range(len(who)), key=lambda k: (who[k].received_ns, who[k].report_id, k))
@@ -215,7 +302,11 @@ def _observed(memory: TileMemory, window: MergedWindow, changed: I32, agrees: ND
     rows, reports = window.statements.rows, window.statements.reports
     disputed = np.unique(rows["voxel_id"])
     own = [rows["report"] == k for k in range(len(reports))]
-    seen = [one.change.observed for one in reports]
+    met = rows["voxel_id"][is_met(rows)]
+    seen = [
+        np.union1d(one.change.observed, met[rows["report"][is_met(rows)] == k]) if len(met) else one.change.observed
+        for k, one in enumerate(reports)
+    ]
     confirmed = [
         np.concatenate([ids[find(disputed, ids) < 0], rows["voxel_id"][mine & agrees]])
         for ids, mine in zip(seen, own, strict=True)

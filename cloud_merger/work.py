@@ -9,7 +9,8 @@ from gnd.cloud_merger.belief import ShiftTests, courses_of
 from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.features.kept import FeatureContents, said_of
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
-from gnd.cloud_merger.map_parameters import text_of, with_text
+from gnd.cloud_merger.groups import joined
+from gnd.cloud_merger.map_parameters import has_hearing, text_of, with_text
 from gnd.cloud_merger.snapping import REMEMBERED_TILES, Snapping
 from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window
 from gnd.cloud_merger.window import WindowMerger, fold, provenance_of
@@ -134,11 +135,13 @@ class Worker:
             self._store.postpone(claim, RETRY_S * claim.attempts)
 
     def _named(self, layer: str, tile: TileId) -> frozenset[str]:
-        """Who is shifted again and again, who does not count, and who is behind a version of this tile that was
-        withdrawn: alone they change nothing here until they are cleared.
+        """Who is shifted again and again, who does not count, who is behind a version of this tile that was withdrawn
+        (alone they change nothing here until they are cleared), who is not believed alone, and who has one vote with
+        others.
         """
         out = (QUARANTINED + vehicle for vehicle in self._store.quarantined_vehicles())
-        return self._store.shifted_vehicles().union(out, self._store.doubted_vehicles(layer, tile))
+        marks = self._store.marks_of_tile(layer, tile)
+        return self._store.shifted_vehicles().union(out, self._store.doubted_vehicles(layer, tile), marks)
 
     def _of_gaussians(self, work: TileWork, named: frozenset[str]) -> Publication:
         """Of a tile of the voxel map."""
@@ -158,6 +161,11 @@ class Worker:
             lambda state, merged, _reports: fold(state, merged),
         )
         now, version = merges[-1], work.base_version + 1
+        # others were judged when they were closed
+        windows = zip([*closed, work.journal.window], merges, strict=True)
+        new_merges = [
+            (window, merged) for window, merged in windows if window not in again
+        ]  # others were judged before
         # the very object where nothing was decided otherwise: its hash is known
         new = self._made.of(now.gaussians, lambda: Tile(tile, version, now.gaussians), (tile, version))
         self._contents.keep(new)
@@ -166,12 +174,9 @@ class Worker:
             voxel_reports=provenance_of(merges),
             waiting=now.gated.waiting,
             shift_tests=tuple(test for one in merges for test in one.believed.tests),
-            agreement_tests=tuple(
-                test
-                for window, one in zip([*closed, work.journal.window], merges, strict=True)
-                for test in one.agreement
-                if window not in again  # judged when it was closed
-            ),
+            agreement_tests=tuple(test for _, merged in new_merges for test in merged.agreement),
+            standings=tuple(one for window, merged in new_merges for one in merged.standings(window)),
+            coincidences=joined(one for _, merged in new_merges for one in merged.coincidences),
             courses=courses_of(one for reports in by_window.values() for one in reports),
             memory=encode_state(tile, closed[-1], state) if closed else None,
         )
@@ -194,7 +199,16 @@ class Worker:
         config = self._config if how.parameters == self._parameters else with_text(self._config, how.parameters)
         shifts = self._shifts
         bases = self._bases(work)
-        return WindowMerger(config.merge, config.confirmation, shifts, bases, how.named, self._snapping)
+        return WindowMerger(
+            config.merge,
+            config.confirmation,
+            shifts,
+            bases,
+            how.named,
+            self._snapping,
+            has_hearing(how.parameters),
+            self._store.owners_of({row.vehicle for row in work.reports}),
+        )
 
     def _of_features(self, work: TileWork) -> Publication:
         """Of a tile of a feature layer."""

@@ -17,7 +17,7 @@ from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import diff
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER, StoredTile
 from gnd.vehicle_agent.link.outbox import Outbox
 
@@ -83,7 +83,7 @@ def account_traffic(folder: RunFolder, links: Sequence[str] = DEFAULT_LINKS) -> 
     }
 
 
-def lost_reports(folder: RunFolder, store: SqliteStore, layers: Sequence[str] = (DEFAULT_LAYER,)) -> list[str]:
+def lost_reports(folder: RunFolder, store: SqlStore, layers: Sequence[str] = (DEFAULT_LAYER,)) -> list[str]:
     """Return the ids of reports that a vehicle made but neither the store nor its quarantine can show.
 
     Args:
@@ -122,12 +122,12 @@ class TileHistory:
         return len(delta.removed) + len(delta.put)
 
 
-def tile_histories(store: SqliteStore, layer: str = DEFAULT_LAYER) -> list[TileHistory]:
+def tile_histories(store: SqlStore, layer: str = DEFAULT_LAYER) -> list[TileHistory]:
     """Return every tile of a store as it was in its epoch and as it is now."""
     return [_history(store, layer, entry.tile, entry.version) for entry in store.heads(layer)]
 
 
-def _history(store: SqliteStore, layer: str, tile: Any, version: int) -> TileHistory:
+def _history(store: SqlStore, layer: str, tile: Any, version: int) -> TileHistory:
     head = store.get(layer, tile, version)
     if head is None:
         raise LookupError(f"version {version} of tile {tile.path} was listed but is not there")

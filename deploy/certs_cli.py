@@ -163,6 +163,30 @@ def publish(authority: Path, **options: Any) -> None:
     _publish(Authority(authority), **options)
 
 
+@certs.command(short_help="Sign a router's list of members with a PKI of your own.")
+@click.argument("names", nargs=-1, metavar="MEMBER...")
+@click.option("--key", type=PATH, required=True, help="Private key of an authority that the router trusts, PEM.")
+@click.option("--to", "folder", type=PATH, required=True, help="Identity folder of the router.")
+@click.option("--revoked", multiple=True, metavar="MEMBER", help="Who is shut out; repeatable.")
+def members(names: tuple[str, ...], key: Path, folder: Path, revoked: tuple[str, ...]) -> None:
+    """Sign the list of all members, for a router whose certificates do not come from `gnd certs`.
+
+    A MEMBER is a name such as vehicle.v-17, or a certificate in PEM. The list replaces the one in the folder under the
+    next number; a running router takes it up by itself.
+    """
+    from gnd.fleet_bus.identity.foreign import sign_members
+
+    listed = sign_members(folder, key, map(_named, names), map(_named, revoked))
+    click.echo(f"list {listed.number} in {folder}: {len(listed.members)} members, {len(listed.revoked)} shut out")
+
+
+def _named(text: str) -> MemberName:
+    """The member of a name or of a certificate's file."""
+    from gnd.fleet_bus.identity.foreign import member_of_file
+
+    return member_of_file(Path(text)) if Path(text).is_file() else MemberName.parse(text)
+
+
 @certs.command(short_help="Renew certificates.")
 @click.argument("folders", nargs=-1, required=True, type=PATH)
 @_AUTHORITY

@@ -16,7 +16,7 @@ from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.gnd_map.tile import TileDelta, apply, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER
 
 
@@ -64,7 +64,7 @@ def _by_vehicle(scores: dict[str, Evaluation]) -> dict[str, float]:
 NO_TRUTH: dict[str, Any] = {"before": None, "single": None, "after": None}
 
 
-def score_run(truth: Truth, store: SqliteStore, histories: Iterable[TileHistory]) -> RunScores:
+def score_run(truth: Truth, store: SqlStore, histories: Iterable[TileHistory]) -> RunScores:
     """Compare a finished run with the truth.
 
     Args:
@@ -88,9 +88,7 @@ def score_run(truth: Truth, store: SqliteStore, histories: Iterable[TileHistory]
     )
 
 
-def maps_of_vehicles(
-    store: SqliteStore, base: Tiles, final: Tiles
-) -> tuple[dict[str, dict[TileId, Gaussians]], set[str]]:
+def maps_of_vehicles(store: SqlStore, base: Tiles, final: Tiles) -> tuple[dict[str, dict[TileId, Gaussians]], set[str]]:
     """Return for each vehicle the base map changed by its own reports, and which vehicles held more than the base map.
 
     A voxel that it observed is as it said: the new Gaussian, nothing, or as in the version that it held. Where the
@@ -128,7 +126,7 @@ def with_statement(tile: Gaussians, held: Gaussians, change: TileChange, final: 
     return apply(after, TileDelta(np.intersect1d(gone, after.voxel_id), there))
 
 
-def _held(store: SqliteStore, change: TileChange, base: Tiles) -> Gaussians:
+def _held(store: SqlStore, change: TileChange, base: Tiles) -> Gaussians:
     if not change.base_sha:
         return Gaussians.empty()
     stored = store.by_sha(DEFAULT_LAYER, change.tile, change.base_sha)

@@ -13,7 +13,7 @@ from gnd.fleet_sim.world import read_world
 from gnd.gnd_map.features import Feature, FeatureTile, feature_id_of
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.features import FeatureReport
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 
 
 def put_base_layers(store: Path, features: Path, layers: Sequence[str]) -> None:
@@ -31,7 +31,7 @@ def put_base_layers(store: Path, features: Path, layers: Sequence[str]) -> None:
                 opened.put_tiles(known[layer], layer=layer)
 
 
-def score_layers(world: Path, store: SqliteStore, layers: Sequence[str]) -> dict[str, Any]:
+def score_layers(world: Path, store: SqlStore, layers: Sequence[str]) -> dict[str, Any]:
     """Compare feature layers with the truth: the map before, each drive alone, the map after.
 
     Args:
@@ -47,7 +47,7 @@ def score_layers(world: Path, store: SqliteStore, layers: Sequence[str]) -> dict
     return {layer: _score(truth, store, layer) for layer in layers}
 
 
-def _score(truth: FeatureTruth, store: SqliteStore, layer: str) -> dict[str, Any]:
+def _score(truth: FeatureTruth, store: SqlStore, layer: str) -> dict[str, Any]:
     before, after = base_tiles(store, layer), newest_tiles(store, layer)
     alone = [score_features(truth, layer, tiles) for tiles in tiles_of_vehicles(store, layer, before).values()]
     stages = {"before": [score_features(truth, layer, before)], "single": alone}
@@ -79,29 +79,27 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return round(fmean(known), 4) if known else None
 
 
-def base_tiles(store: SqliteStore, layer: str) -> list[FeatureTile]:
+def base_tiles(store: SqlStore, layer: str) -> list[FeatureTile]:
     """Return the tiles of a layer as they were before anything was merged."""
     return [tile for entry in store.heads(layer) if (tile := _at_epoch(store, layer, entry.tile)) is not None]
 
 
-def newest_tiles(store: SqliteStore, layer: str) -> list[FeatureTile]:
+def newest_tiles(store: SqlStore, layer: str) -> list[FeatureTile]:
     """Return the tiles of a layer as they are now."""
     return [tile for entry in store.heads(layer) if (tile := _decoded(store, layer, entry.tile, None)) is not None]
 
 
-def _at_epoch(store: SqliteStore, layer: str, tile_id: TileId) -> FeatureTile | None:
+def _at_epoch(store: SqlStore, layer: str, tile_id: TileId) -> FeatureTile | None:
     epochs = [info.version for info in store.history(layer, tile_id) if info.kind != "merged"]
     return _decoded(store, layer, tile_id, epochs[-1]) if epochs else None
 
 
-def _decoded(store: SqliteStore, layer: str, tile_id: TileId, version: int | None) -> FeatureTile | None:
+def _decoded(store: SqlStore, layer: str, tile_id: TileId, version: int | None) -> FeatureTile | None:
     stored = store.get(layer, tile_id, version)
     return None if stored is None else stored.decode_features()
 
 
-def tiles_of_vehicles(
-    store: SqliteStore, layer: str, before: Sequence[FeatureTile]
-) -> dict[str, tuple[FeatureTile, ...]]:
+def tiles_of_vehicles(store: SqlStore, layer: str, before: Sequence[FeatureTile]) -> dict[str, tuple[FeatureTile, ...]]:
     """Return for each vehicle the layer as its own reports alone would have it."""
     absent: dict[str, set[int]] = defaultdict(set)
     found: dict[str, dict[TileId, list[Feature]]] = defaultdict(lambda: defaultdict(list))

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from gnd.deploy import features_tables as tables
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.tile_store.cli import PATH, json_option, region_option, show, store_to_fill
 from gnd.tile_store.feature_io.about import about_options
 from gnd.tile_store.feature_io.errors import FeatureFileError
@@ -19,7 +20,8 @@ from gnd.tile_store.feature_io.geojson_export import as_geojson
 from gnd.tile_store.feature_io.placement import Placement
 from gnd.tile_store.feature_io.stored import import_features, load_features, sources_of
 from gnd.tile_store.feature_io.values import LEFT_OUT, SIGMA_M, SURE, ImportOptions, MapFeature, default_source
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.location import LOCATION, StoreLocation, shown
+from gnd.tile_store.options import existing
 
 GEOREFERENCE_HELP: Final = (
     "Where local coordinates lie: latlon (the file's lat and lon hold), LAT,LON[,HEIGHT[,BEARING]] of the local origin "
@@ -38,7 +40,7 @@ def features() -> None:
 
 @features.command(name="import", short_help="Put the features of a file into a store.")
 @click.argument("file", type=PATH)
-@click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
+@click.option("--store", "-o", "path", required=True, type=LOCATION, help="The store; it is made when missing.")
 @click.option("--format", "kind", type=click.Choice(FORMATS), help="  [default: by the file's name]")
 @click.option(
     "--layer", "layers", multiple=True, metavar="KIND=LAYER", help=f"Layer of a kind; {LEFT_OUT}: leave it out."
@@ -54,9 +56,10 @@ def features() -> None:
 @click.option("--strict", is_flag=True, help="Refuse a file with lines or borders that cross; else they are reported.")
 @click.option("--city", help="Of an Argoverse 2 map: PIT, ...  [default: by the file's name]")
 @json_option
+@identity_option
 def import_(
     file: Path,
-    path: Path,
+    path: StoreLocation,
     kind: str | None,
     layers: tuple[str, ...],
     other: str | None,
@@ -86,7 +89,7 @@ def import_(
         read = read_features(file, name, options, kind, city, bars)
         with store_to_fill(path) as store:
             result = import_features(store, read, name, about_options(options), bars)
-    show(asdict(result), as_json, lambda console: tables.print_import(console, str(path), result))
+    show(asdict(result), as_json, lambda console: tables.print_import(console, shown(path), result))
 
 
 def _layers(said: Sequence[str]) -> dict[str, str]:
@@ -122,7 +125,7 @@ def _anchor(said: str) -> Placement:
 
 
 @features.command(short_help="Write a store's features to a file.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("out", metavar="FILE", type=PATH)
 @click.option("--layer", "layers", multiple=True, help="A layer, or several.  [default: all]")
 @region_option
@@ -130,28 +133,36 @@ def _anchor(said: str) -> Placement:
 @click.option("--source", help="Write into the file imported as this; '': a new file.  [default: the only one]")
 @json_option
 def export(
-    path: Path, out: Path, layers: tuple[str, ...], region: str, kind: str | None, source: str | None, as_json: bool
+    path: StoreLocation,
+    out: Path,
+    layers: tuple[str, ...],
+    region: str,
+    kind: str | None,
+    source: str | None,
+    as_json: bool,
 ) -> None:
     """Write the newest features of STORE to FILE: GeoJSON, Lanelet2 (.osm) or OpenDRIVE (.xodr).
 
     A Lanelet2 or OpenDRIVE file that was imported comes back with all that is no feature; only what has changed is
     written anew. A new Lanelet2 file has the lanes of every source as lanelets.
     """
-    with SqliteStore(path, create=False) as store:
+    with existing(path) as store:
         result = export_features(store, out, layers, region, kind, source)
     show(asdict(result), as_json, lambda console: tables.print_export(console, result))
 
 
 @features.command(name="list", short_help="The features of a store.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.option("--layer", "layers", multiple=True, help="A layer, or several.  [default: all]")
 @region_option
 @click.option("--kind", help="Only of this kind.")
 @click.option("--limit", default=100, show_default=True, type=click.IntRange(0), help="At most so many.")
 @json_option
-def list_(path: Path, layers: tuple[str, ...], region: str, kind: str | None, limit: int, as_json: bool) -> None:
+def list_(
+    path: StoreLocation, layers: tuple[str, ...], region: str, kind: str | None, limit: int, as_json: bool
+) -> None:
     """The features of STORE, a line each, and how many there are by layer."""
-    with SqliteStore(path, create=False) as store:
+    with existing(path) as store:
         found = [one for one in load_features(store, layers, region) if kind in (None, one.kind)]
         sources = {name: {"format": one.format, **_counts(one.ids)} for name, one in sources_of(store).items()}
     values = {
@@ -160,7 +171,7 @@ def list_(path: Path, layers: tuple[str, ...], region: str, kind: str | None, li
         "sources": sources,
         "listed": [_row(one) for one in found[:limit]],
     }
-    show(values, as_json, lambda console: tables.print_list(console, str(path), values))
+    show(values, as_json, lambda console: tables.print_list(console, shown(path), values))
 
 
 def _counts(ids: Any) -> dict[str, int]:
@@ -188,15 +199,15 @@ def _row(feature: MapFeature) -> dict[str, Any]:
 
 
 @features.command(name="show", short_help="One feature of a store.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("feature_id", metavar="ID", type=int)
 @json_option
-def show_(path: Path, feature_id: int, as_json: bool) -> None:
+def show_(path: StoreLocation, feature_id: int, as_json: bool) -> None:
     """One feature of STORE: as GeoJSON, with its tiles and the reports that it comes from."""
-    with SqliteStore(path, create=False) as store:
+    with existing(path) as store:
         found = [one for one in load_features(store) if one.feature_id == feature_id]
         if not found:
-            raise FeatureFileError(f"{path}: no feature {feature_id}; gnd features list shows what there is")
+            raise FeatureFileError(f"{shown(path)}: no feature {feature_id}; gnd features list shows what there is")
         values = as_geojson(found[0]) | tables.whereabouts(store, found[0])
     show(values, as_json, lambda console: console.print(tables.feature(values)))
 

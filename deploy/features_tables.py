@@ -10,7 +10,7 @@ from gnd.tile_store import tables
 from gnd.tile_store.feature_io.formats import FeaturesExported
 from gnd.tile_store.feature_io.stored import ImportResult, layer_tiles
 from gnd.tile_store.feature_io.values import MapFeature
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 
 
 def print_import(console: Console, path: str, result: ImportResult) -> None:
@@ -86,7 +86,7 @@ def feature(values: dict[str, Any]) -> Table:
     return tables.fields(f"feature {values['id']}", told | places | reports)
 
 
-def whereabouts(store: SqliteStore, found: MapFeature) -> dict[str, list[str]]:
+def whereabouts(store: SqlStore, found: MapFeature) -> dict[str, list[str]]:
     """The tiles that a feature lies in, and the reports that its newest versions come from."""
     tiles = [
         one for one in layer_tiles(store, found.layer) if any(f.feature_id == found.feature_id for f in one.features)

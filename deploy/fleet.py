@@ -31,7 +31,7 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.links import load_link
 from gnd.gnd_map.settings import from_settings, merged
 from gnd.schemas.keys import traffic_keys
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.vehicle_agent.agent import AgentConfig
 from gnd.vehicle_agent.settings import agent_of
 from gnd.vehicle_agent.sources.world_clock import Departure, WorldClock, make_clock
@@ -226,7 +226,7 @@ class _FleetRun:
     config: FleetConfig
     folder: RunFolder
     supervisor: Supervisor
-    store: SqliteStore
+    store: SqlStore
     view: LiveView
     state: FleetState
     stop: threading.Event

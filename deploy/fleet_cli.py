@@ -191,6 +191,9 @@ def run(
     from gnd.deploy.fleet import run_fleet
     from gnd.deploy.live import progress_bars
     from gnd.deploy.processes import start_fork_server
+    from gnd.tile_store.signatures import sign_unsigned
+    from gnd.tile_store.signing import Signing
+    from gnd.tile_store.sqlite_store import SqliteStore
 
     console = Console(stderr=True)
     stop, started_s = _stop_on_sigterm(), time.monotonic()
@@ -209,6 +212,8 @@ def run(
     if secure:
         identities = make_identities(folder.root, config.shards, len(prepared.agent_drives))
         prepared = dataclasses.replace(prepared, identities=identities)
+        with SqliteStore(folder.store, signing=Signing(identities / "fleet")) as store:
+            sign_unsigned(store)  # the base map: without that no vehicle would take it
     prepare_s = time.monotonic() - started_s
     with place() as site:
         outcome = run_fleet(config, folder, prepared, console, stop, site)

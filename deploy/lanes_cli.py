@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gnd.deploy.lane_edits import MapEdits, lane_edits, map_pieces, painted
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.gnd_map.features import Feature
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.cli import PATH, json_option, show, store_to_fill
@@ -20,6 +21,7 @@ from gnd.tile_store.feature_io.stored import layer_tiles
 from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions, default_source
 from gnd.tile_store.feature_io.whole_file import write_whole
 from gnd.tile_store.feature_io.xml_spans import read_bytes
+from gnd.tile_store.location import LOCATION, StoreLocation, shown
 from gnd.tile_store.options import to_read
 from gnd.vehicle_agent.features.lanes.lane_mapper import MARKINGS
 
@@ -42,17 +44,18 @@ def _map(file: Path, source: str | None) -> tuple[FeatureFile, str, ImportOption
 
 @lanes.command(name="import", short_help="Put a map's painted borders into a store, in pieces.")
 @click.argument("file", metavar="MAP.osm", type=PATH)
-@click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
+@click.option("--store", "-o", "path", required=True, type=LOCATION, help="The store; it is made when missing.")
 @_SOURCE
 @_LAYER
 @json_option
-def import_(file: Path, path: Path, source: str | None, layer: str, as_json: bool) -> None:
+@identity_option
+def import_(file: Path, path: StoreLocation, source: str | None, layer: str, as_json: bool) -> None:
     """Put the painted borders of MAP.osm into a store: the first version of the layer that vehicles compare with."""
     read, name, _ = _map(file, source)
     tiles = map_pieces(read.features)
     with store_to_fill(path) as store:
         if layer_tiles(store, layer):
-            raise FeatureFileError(f"{path}: layer {layer} has tiles already; what vehicles found would be lost")
+            raise FeatureFileError(f"{shown(path)}: layer {layer} has tiles already; what vehicles found would be lost")
         results = store.put_tiles(tiles.values(), "base", layer)
     values = {
         "source": name,
@@ -61,27 +64,34 @@ def import_(file: Path, path: Path, source: str | None, layer: str, as_json: boo
         "pieces": sum(len(tile.features) for tile in tiles.values()),
         "tiles": len(results),
     }
-    told = f"{path}, layer {layer}: {values['pieces']} pieces of {values['borders']} borders in {len(results)} tiles"
+    made = f"{values['pieces']} pieces of {values['borders']} borders in {len(results)} tiles"
+    told = f"{shown(path)}, layer {layer}: {made}"
     show(values, as_json, lambda console: console.print(told))
 
 
 @lanes.command(short_help="What changed, as edits of a Lanelet2 map.")
 @click.argument("file", metavar="MAP.osm", type=PATH)
-@click.option("--store", "path", required=True, type=PATH, help="The store in which vehicles keep the layer.")
+@click.option("--store", "path", required=True, type=LOCATION, help="The store in which vehicles keep the layer.")
 @click.option("--out", "-o", type=PATH, help="Write the edits here (osmChange, .osc).")
 @click.option("--edited", type=PATH, help="Write the whole map after the edits here, too.")
 @_SOURCE
 @_LAYER
 @json_option
 def edits(
-    file: Path, path: Path, out: Path | None, edited: Path | None, source: str | None, layer: str, as_json: bool
+    file: Path,
+    path: StoreLocation,
+    out: Path | None,
+    edited: Path | None,
+    source: str | None,
+    layer: str,
+    as_json: bool,
 ) -> None:
     """Compare MAP.osm with the layer of a store and tell what changed: borders moved, gone, new, painted otherwise."""
     read, name, options = _map(file, source)
     with to_read(path) as store:
         tiles: dict[TileId, tuple[Feature, ...]] = {one.tile_id: one.features for one in layer_tiles(store, layer)}
     if not tiles:
-        raise FeatureFileError(f"{path}: no tiles of layer {layer}; put the map there first: gnd lanes import")
+        raise FeatureFileError(f"{shown(path)}: no tiles of layer {layer}; put the map there first: gnd lanes import")
     found = lane_edits(read, tiles, name, options)
     for target, data in ((out, found.change.data), (edited, found.edited)):
         if target is not None:

@@ -24,7 +24,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.way import Milestone
@@ -50,7 +50,7 @@ class FirstStatement:
     is_merged: bool
 
 
-def first_statements(store: SqliteStore) -> dict[str, dict[TileId, FirstStatement]]:
+def first_statements(store: SqlStore) -> dict[str, dict[TileId, FirstStatement]]:
     """Return the first report of each vehicle about each tile, by vehicle and tile."""
     said: list[tuple[int, str, str, TileChange]] = []
     for row in store.reports():
@@ -64,7 +64,7 @@ def first_statements(store: SqliteStore) -> dict[str, dict[TileId, FirstStatemen
     return found
 
 
-def _statement(store: SqliteStore, change: TileChange) -> FirstStatement:
+def _statement(store: SqlStore, change: TileChange) -> FirstStatement:
     stored = store.by_sha(DEFAULT_LAYER, change.tile, change.base_sha) if change.base_sha else None
     if stored is None:
         return FirstStatement(change, Gaussians.empty(), is_merged=False)
@@ -186,7 +186,7 @@ def clock_of(ways: Iterable[list[Milestone]]) -> F64:
     return np.stack([times_s[:, 0], np.maximum.accumulate(times_s[:, 1])], axis=1)
 
 
-def account_learning(folder: RunFolder, store: SqliteStore, truth: Truth | None, base: Tiles) -> dict[str, Any]:
+def account_learning(folder: RunFolder, store: SqlStore, truth: Truth | None, base: Tiles) -> dict[str, Any]:
     """Return what the vehicles of a finished run had from each other.
 
     Args:

@@ -8,15 +8,19 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from gnd.deploy.archive_cli import fetch, publish
 from gnd.deploy.erase_cli import erase
 from gnd.deploy.map_export.command import diff, export
 from gnd.deploy.map_export.serve import serve
+from gnd.deploy.sign_cli import sign
 from gnd.deploy.tile_memory_cli import memory
 from gnd.deploy.vehicle_rollback_cli import rollback
 from gnd.deploy.verify_cli import verify
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.tile_store import tables
 from gnd.tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
 from gnd.tile_store.cli import map_group as store_group
+from gnd.tile_store.location import LOCATION, StoreLocation, file_of, shown
 from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 from gnd.vehicle_agent.map_align.command import align
 
@@ -29,16 +33,17 @@ MODES: Final = ("auto", "always", "never")
 
 @click.command(short_help="Build a map from drives with known poses.")
 @click.argument("drives", nargs=-1, required=True, type=PATH)
-@click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
+@click.option("--store", "-o", "path", required=True, type=LOCATION, help="The store; it is made when missing.")
 @click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=CODEC_HELP)
 @click.option("--keep-movers", is_flag=True, help="Keep points on moving objects and on the vehicle itself.")
 @click.option("--refine-poses", "refine", default="auto", show_default=True, type=click.Choice(MODES), help=REFINE_HELP)
 @click.option("--report", type=PATH, help="Write the quality of the map as a page (one HTML file).")
 @layer_option
 @json_option
+@identity_option
 def build(
     drives: tuple[Path, ...],
-    path: Path,
+    path: StoreLocation,
     codec: str,
     keep_movers: bool,
     refine: Any,
@@ -63,20 +68,21 @@ def build(
 
     if report is not None:
         check_writable(report)
-    drives = drives_of(drives, path.with_name(f"{path.stem}_drives"), partial(click.echo, err=as_json))
+    file = file_of(path) or Path("map")  # what is made of recordings lies beside the store, or here
+    drives = drives_of(drives, file.with_name(f"{file.stem}_drives"), partial(click.echo, err=as_json))
     with store_to_fill(path) as opened, _bars() as bars:
         built = build_recorded_map(
             drives, opened, layer=layer, codec=codec, keep_movers=keep_movers, refine=refine, progress=_Shown(bars)
         )
     quality = measure(built)
     if report is not None:
-        write_map_page(report, path.name, built, quality)
+        write_map_page(report, file.name, built, quality)
     values = summary(built, quality)
-    show(values, as_json, lambda console: _print(console, f"{path}, layer {layer}", values))
+    show(values, as_json, lambda console: _print(console, f"{shown(path)}, layer {layer}", values))
     if report is not None and not as_json:
         click.echo(f"page written: {report}")
     if not as_json:
-        for line in after_map_build(drives, path):
+        for line in after_map_build(drives, shown(path)):
             click.echo(line)
 
 
@@ -122,13 +128,16 @@ def _bars() -> Progress:
 _COMMANDS = {
     **store_group.commands,
     "rollback": rollback,
+    "sign": sign,
     "erase": erase,
     "export": export,
+    "publish": publish,
+    "fetch": fetch,
     "serve": serve,
     "diff": diff,
 }
 map_group = click.Group(
     "map",
     commands=[build, align, verify, memory, *_COMMANDS.values()],
-    help="Build, align, inspect, compare, export, serve, verify, roll back and erase.",
+    help="Build, align, inspect, compare, export, serve, publish, fetch, verify, sign, roll back and erase.",
 )

@@ -8,7 +8,7 @@ import numpy as np
 
 from gnd.deploy.run_folder import RunFolder
 from gnd.gnd_map.tile_id import TileId
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER, VersionInfo
 from gnd.vehicle_agent.way import Milestone, read_way
 
@@ -36,7 +36,7 @@ class MapUse:
 class Versions:
     """What is known of tile versions; each tile's history is read once for all the versions it has by then."""
 
-    def __init__(self, store: SqliteStore, layer: str = DEFAULT_LAYER) -> None:
+    def __init__(self, store: SqlStore, layer: str = DEFAULT_LAYER) -> None:
         self._store, self._layer = store, layer
         self._known: dict[tuple[int, int], VersionInfo | None] = {}
 

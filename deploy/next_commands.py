@@ -11,7 +11,7 @@ BOXES: Final = 4
 RUN: Final = "healed"
 
 
-def after_map_build(drives: Sequence[Path], store: Path) -> list[str]:
+def after_map_build(drives: Sequence[Path], store: Path | str) -> list[str]:
     """With a recording of another day, and with this one alone."""
     alone = next((drive for drive in drives if {GNSS_TOPIC, MOTION_TOPIC} <= set(topics_of(drive))), None)
     lines = [

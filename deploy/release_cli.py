@@ -6,24 +6,25 @@ import socket
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import releasing
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.arguments import parse_tile
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.options import PATH, existing, json_option, layer_option, show, to_read
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.location import LOCATION, StoreLocation, shown
+from gnd.tile_store.options import existing, json_option, layer_option, show, to_publish, to_read
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.trials import VersionTrial
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-Steer = Callable[[SqliteStore, VersionTrial, str, str], bool]
+Steer = Callable[[SqlStore, VersionTrial, str, str], bool]
 
 
 @click.group()
@@ -32,23 +33,24 @@ def release() -> None:
 
 
 def _steering(command: _F) -> _F:
-    """Adds STORE, TILE, --why, --layer and --json."""
+    """Adds STORE, TILE, --why, --layer, --identity and --json."""
     for decorate in (
+        identity_option,
         json_option,
         layer_option,
         click.option("--why", required=True, help="Why, for who looks later; it is kept in the store."),
         click.argument("tile"),
-        click.argument("path", metavar="STORE", type=PATH),
+        click.argument("path", metavar="STORE", type=LOCATION),
     ):
         command = decorate(command)
     return command
 
 
 @release.command("list", short_help="The versions on trial, and those settled lately.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.option("--settled", default=10, show_default=True, type=click.IntRange(0, 10_000), help="How many of them.")
 @json_option
-def list_trials(path: Path, settled: int, as_json: bool) -> None:
+def list_trials(path: StoreLocation, settled: int, as_json: bool) -> None:
     """The versions on trial, and the newest that were released or withdrawn."""
     with to_read(path) as store:
         found = [*store.look(trials.all_open), *store.look(lambda c: trials.settled(c, settled))]
@@ -57,17 +59,17 @@ def list_trials(path: Path, settled: int, as_json: bool) -> None:
 
 
 @release.command("show", short_help="A tile's trials, what vehicles told, whose reports are doubted, who steered.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("tile")
 @layer_option
 @json_option
-def show_tile(path: Path, tile: str, layer: str, as_json: bool) -> None:
+def show_tile(path: StoreLocation, tile: str, layer: str, as_json: bool) -> None:
     """All about the trials of TILE (path, number, or lat,lon in degrees)."""
     tile_id = parse_tile(tile)
     with to_read(path) as store:
         known = store.look(lambda c: trials.of_tile(c, layer, tile_id))
         if not known:
-            raise StoreError(f"no version of tile {tile_id.path} of layer {layer} was ever on trial in {path}")
+            raise StoreError(f"no version of tile {tile_id.path} of layer {layer} was ever on trial in {shown(path)}")
         open_trial = store.trials(layer, tile_id.path).get(tile_id)
         said = [] if open_trial is None else store.look(lambda c: trials.health(c, open_trial))
         values = {
@@ -81,35 +83,35 @@ def show_tile(path: Path, tile: str, layer: str, as_json: bool) -> None:
 
 @release.command(short_help="Decide nothing about a version on trial until somebody does.")
 @_steering
-def pause(path: Path, tile: str, why: str, layer: str, as_json: bool) -> None:
+def pause(path: StoreLocation, tile: str, why: str, layer: str, as_json: bool) -> None:
     """Leave the version of TILE that is on trial where it is: no automatic release, no withdrawal."""
     _steer(path, tile, layer, as_json, why, lambda *of: releasing.hold(*of, paused=True))
 
 
 @release.command(short_help="Let vehicles decide again about a paused version.")
 @_steering
-def resume(path: Path, tile: str, why: str, layer: str, as_json: bool) -> None:
+def resume(path: StoreLocation, tile: str, why: str, layer: str, as_json: bool) -> None:
     """Take up the trial of TILE again after a pause."""
     _steer(path, tile, layer, as_json, why, lambda *of: releasing.hold(*of, paused=False))
 
 
 @release.command(short_help="Give a version on trial to everybody now.")
 @_steering
-def advance(path: Path, tile: str, why: str, layer: str, as_json: bool) -> None:
+def advance(path: StoreLocation, tile: str, why: str, layer: str, as_json: bool) -> None:
     """Release the version of TILE that is on trial, whatever vehicles have told so far."""
     _steer(path, tile, layer, as_json, why, releasing.release)
 
 
 @release.command(short_help="Take a version on trial back.")
 @_steering
-def withdraw(path: Path, tile: str, why: str, layer: str, as_json: bool) -> None:
+def withdraw(path: StoreLocation, tile: str, why: str, layer: str, as_json: bool) -> None:
     """Publish the content before the trial as the next version of TILE, and doubt the reports behind the trial."""
     _steer(path, tile, layer, as_json, why, releasing.withdraw)
 
 
 @release.command(short_help="Believe doubted reports again.")
 @_steering
-def clear(path: Path, tile: str, why: str, layer: str, as_json: bool) -> None:
+def clear(path: StoreLocation, tile: str, why: str, layer: str, as_json: bool) -> None:
     """Believe the reports behind a withdrawn version of TILE again: they are merged as if they came now."""
     # loaded here: it loads numpy and numba, which the other commands do without
     from gnd.cloud_merger.release.doubts import clear_and_reenter
@@ -121,9 +123,9 @@ def clear(path: Path, tile: str, why: str, layer: str, as_json: bool) -> None:
     show(values, as_json, lambda console: console.print(f"{cleared} reports about {tile_id.path} are believed again"))
 
 
-def _steer(path: Path, tile: str, layer: str, as_json: bool, why: str, work: Steer) -> None:
+def _steer(path: StoreLocation, tile: str, layer: str, as_json: bool, why: str, work: Steer) -> None:
     tile_id = parse_tile(tile)
-    with existing(path) as store:
+    with to_publish(path) as store:
         trial = _open_trial(store, layer, tile_id)
         if not work(store, trial, _who(), why):
             raise StoreError(f"version {trial.version} of tile {tile_id.path} was settled meanwhile; nothing was done")
@@ -134,7 +136,7 @@ def _steer(path: Path, tile: str, layer: str, as_json: bool, why: str, work: Ste
     show(values, as_json, lambda console: console.print(f"{tile_id.path} version {now.version}: {now.state}"))
 
 
-def _open_trial(store: SqliteStore, layer: str, tile: TileId) -> VersionTrial:
+def _open_trial(store: SqlStore, layer: str, tile: TileId) -> VersionTrial:
     found = store.trials(layer, tile.path).get(tile)
     if found is None:
         raise StoreError(f"no version of tile {tile.path} of layer {layer} is on trial; `gnd release list` shows them")

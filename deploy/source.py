@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gnd.deploy.errors import DeployError
+from gnd.tile_store.location import file_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,10 @@ class Source:
         """Refuse options that contradict each other."""
         if self.base_map is not None and not self.drives:
             raise DeployError("--map goes with --drives: a simulated run builds its own map")
+        if self.base_map is not None and file_of(str(self.base_map)) is None:
+            raise DeployError(
+                "--map takes a file: a run has its own store; one in a database is for `gnd store` and `gnd merger`"
+            )
         if self.made_up and not self.drives:
             raise DeployError("--made-up goes with --drives: a simulated street has changes of its own")
         if self.worlds is not None and self.drives:

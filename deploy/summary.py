@@ -19,7 +19,7 @@ from gnd.fleet_sim.pictures import StreetView, draw_healing, draw_map, draw_run
 from gnd.fleet_sim.truth import Truth, read_truth
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.settings import settings_sha256
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.status import named_vehicles, waiting_totals
 
 
@@ -71,7 +71,7 @@ def _counts(
     prepared: PreparedRun,
     outcome: FleetOutcome,
     results: FleetResults,
-    store: SqliteStore,
+    store: SqlStore,
     histories: list[TileHistory],
 ) -> dict[str, Any]:
     return {
@@ -94,9 +94,7 @@ def _counts(
     }
 
 
-def _evaluate(
-    folder: RunFolder, truth: Truth | None, store: SqliteStore, histories: list[TileHistory]
-) -> dict[str, Any]:
+def _evaluate(folder: RunFolder, truth: Truth | None, store: SqlStore, histories: list[TileHistory]) -> dict[str, Any]:
     """Compare with the truth where there is one; draw the maps in any case."""
     base = {history.tile.tile: history.before for history in histories}
     final = {history.tile.tile: history.after for history in histories}
@@ -108,7 +106,7 @@ def _evaluate(
     return score_run(truth, store, histories).as_dict()
 
 
-def _score_features(config: FleetConfig, prepared: PreparedRun, store: SqliteStore) -> dict[str, Any]:
+def _score_features(config: FleetConfig, prepared: PreparedRun, store: SqlStore) -> dict[str, Any]:
     """Compare feature layers with the truth where there is one."""
     if prepared.world is None or not config.feature_layers:
         return {}

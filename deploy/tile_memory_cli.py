@@ -1,7 +1,6 @@
 """`gnd map memory STORE TILE`: what a tile remembers of each voxel or feature."""
 
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import click
@@ -13,16 +12,17 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import tables
 from gnd.tile_store.arguments import parse_tile
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.options import PATH, json_option, layer_option, show, to_read
+from gnd.tile_store.location import LOCATION, StoreLocation
+from gnd.tile_store.options import json_option, layer_option, show, to_read
 from gnd.tile_store.values import StoredMemory
 
 
 @click.command(short_help="The memory of a tile: last observation, observers and confidence of its voxels.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("tile")
 @layer_option
 @json_option
-def memory(path: Path, tile: str, layer: str, as_json: bool) -> None:
+def memory(path: StoreLocation, tile: str, layer: str, as_json: bool) -> None:
     """What the closed windows of a TILE of STORE have left.
 
     Of each voxel: the vehicles that confirmed it, the day of its last observation, the votes that its state is worth

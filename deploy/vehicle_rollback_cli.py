@@ -1,17 +1,18 @@
 """`gnd map rollback STORE vehicle:NAME`: remove the reports of one vehicle; other targets are the store's own."""
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.gnd_map.features import is_feature_layer
 from gnd.tile_store.arguments import parse_time_ns
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.options import PATH, existing, json_option, layer_option, show, to_read
+from gnd.tile_store.location import LOCATION, StoreLocation, shown
+from gnd.tile_store.options import json_option, layer_option, show, to_publish, to_read
 from gnd.tile_store.upkeep_cli import rollback as store_rollback
 from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
@@ -20,7 +21,7 @@ _OLD = "Of the shards, where the store does not say: it was merged by an older r
 
 
 @click.command(short_help="Restore an older state of tiles, or remove the reports of a vehicle.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("place", metavar="TILE|REGION|vehicle:NAME")
 @click.argument("version", type=int, required=False)
 @click.option("--to", help="A version of the tile (3), or a time (2026-01-31T12:00:00Z).")
@@ -28,10 +29,11 @@ _OLD = "Of the shards, where the store does not say: it was merged by an older r
 @click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=_OLD)
 @layer_option
 @json_option
+@identity_option
 @click.pass_context
 def rollback(
     context: click.Context,
-    path: Path,
+    path: StoreLocation,
     place: str,
     version: int | None,
     to: str | None,
@@ -62,17 +64,19 @@ def rollback(
     from gnd.cloud_merger.expel import without_vehicle
 
     since_ns = 0 if to is None else parse_time_ns(to)
-    with to_read(path) if dry_run else existing(path) as store:
+    with to_read(path) if dry_run else to_publish(path) as store:
         config = ShardConfig(store_path=path, codec=codec)
         found = list(without_vehicle(store, config, layer, place.removeprefix(PREFIX), since_ns))
         changed = [tile for _, tile in found if tile is not None]
         if changed and not dry_run:
             store.put_tiles(changed, "rollback", layer)
     if not found:
-        raise StoreError(f"{path}: {place.removeprefix(PREFIX)} has reported nothing about layer {layer} since then")
+        raise StoreError(
+            f"{shown(path)}: {place.removeprefix(PREFIX)} has reported nothing about layer {layer} since then"
+        )
     rows = [asdict(one) | {"tile": one.tile.path} for one, _ in found]
     verb = "would change" if dry_run else "have changed"
-    title = f"{path}, layer {layer}: {len(changed)} of {len(rows)} tiles {verb}"
+    title = f"{shown(path)}, layer {layer}: {len(changed)} of {len(rows)} tiles {verb}"
     values = {"layer": layer, "vehicle": place.removeprefix(PREFIX), "dry_run": dry_run, "tiles": rows}
     show(values, as_json, lambda console: _print(console, title, layer, rows))
 

@@ -2,15 +2,19 @@
 
 from collections import Counter
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, Final
 
 import click
 from rich.console import Console
 from rich.progress import track
 
+from gnd.fleet_bus.identity.names import identity_of_environment
+from gnd.fleet_bus.identity.options import identity_option
+from gnd.fleet_bus.publishers import Publishers
 from gnd.tile_store import tables
-from gnd.tile_store.cli import PATH, json_option, layer_option, region_option, show
+from gnd.tile_store.cli import json_option, layer_option, region_option, show
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.location import LOCATION, StoreLocation, shown
 from gnd.tile_store.options import to_read
 from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
@@ -18,20 +22,36 @@ _OLD: Final = "Of the shards, where the store does not say: it was merged by an 
 
 
 @click.command(short_help="Recompute versions from the reports, and compare.")
-@click.argument("path", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @layer_option
 @region_option
 @click.option("--all-versions", is_flag=True, help="Every stored version, not only the newest of each tile.")
 @click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=_OLD)
 @click.option("--merge-mode", default="default", show_default=True, type=click.Choice(("default", "paper")), help=_OLD)
+@click.option("--signatures", is_flag=True, help="Instead: who answers for them, by the authority of --identity.")
 @json_option
-def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, merge_mode: Any, as_json: bool) -> None:
+@identity_option
+def verify(
+    path: StoreLocation,
+    layer: str,
+    region: str,
+    all_versions: bool,
+    codec: str,
+    merge_mode: Any,
+    signatures: bool,
+    as_json: bool,
+) -> None:
     """Recompute the tiles of store PATH from their journals and compare them bit for bit.
 
     Each window is merged with the parameters that its shard had, which the store keeps.
 
     Ends with 1 where one differs. Versions whose reports retention has removed cannot be computed and are counted.
+
+    With --signatures it says by whom each version is signed, and ends with 1 where nobody answers for one.
     """
+    if signatures:
+        _signatures(path, layer, region, all_versions, as_json)
+        return
     # loaded here: it loads scipy and numba, which the other commands do without
     from gnd.cloud_merger.config import ShardConfig
     from gnd.cloud_merger.parameters import MergeParameters
@@ -53,15 +73,47 @@ def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, 
     show(
         values | {"identical": not counts["differs"], "versions": wrong},
         as_json,
-        lambda console: _print(console, f"{path}, layer {layer}", values, wrong),
+        lambda console: _print(console, f"{shown(path)}, layer {layer}", values, wrong),
     )
     if counts["differs"]:
         raise SystemExit(1)
+
+
+def _signatures(path: StoreLocation, layer: str, region: str, all_versions: bool, as_json: bool) -> None:
+    """Say who answers for the versions of a region."""
+    from gnd.tile_store.signatures import GOOD
+    from gnd.tile_store.signatures import signatures as answered
+
+    with to_read(path) as store:
+        found = list(answered(store, authority_of_environment(), layer, region, all_versions=all_versions))
+    by = Counter(one.who if one.status == GOOD else one.status for one in found)
+    wrong = [asdict(one) | {"tile": one.tile.path} for one in found if one.status != GOOD]
+    signed = {who: n for who, n in sorted(by.items()) if any(one.who == who for one in found)}
+    others = {status: n for status, n in sorted(by.items()) if status not in signed}
+    values: dict[str, Any] = {"versions": len(found), "signed_by": signed, "not_answered_for": others, "wrong": wrong}
+    told = {"versions": len(found), **{f"signed by {who}": n for who, n in signed.items()}, **others}
+    show(values, as_json, lambda console: _print(console, f"{shown(path)}, layer {layer}", told, wrong))
+    if wrong:
+        raise SystemExit(1)
+
+
+def authority_of_environment() -> Publishers:
+    """Whose signatures count, by the identity of this process.
+
+    Raises:
+        StoreError: it has none.
+    """
+    folder = identity_of_environment()
+    if folder is None:
+        raise StoreError("signatures are judged by an authority: --identity FOLDER, of anybody in the fleet")
+    return Publishers(folder)
 
 
 def _print(console: Console, title: str, values: dict[str, Any], wrong: list[dict[str, Any]]) -> None:
     console.print(tables.fields(title, values))
     for one in wrong[:20]:
         console.print(
-            f"{one['tile']} version {one['version']} {one['status']}: {one['reason']}", highlight=False, soft_wrap=True
+            f"{one['tile']} version {one['version']} {one['status']}: {one.get('reason') or one['why']}",
+            highlight=False,
+            soft_wrap=True,
         )

@@ -104,8 +104,21 @@ class TileWatch:
                 stop.wait(_POLL_S)
                 continue
             for version in versions:
-                self._note(version, follower.known)
+                if self._is_proven(version, follower):
+                    self._note(version, follower.known)
         follower.close()
+
+    def _is_proven(self, found: NewVersion, follower: RegionFollower) -> bool:
+        """Whether a publisher answers for it. What the catalog alone names is fetched for that."""
+        asking = self._asking[found.layer]
+        if found.notice is not None or asking.check is None:
+            return True
+        try:
+            return any(tile.version == found.version for tile in asking.fetch([found.tile]))
+        except (BusError, SchemaError) as error:
+            _log.warning("a version of the catalog is left out: %s", error)
+            follower.look_again(found)
+            return False
 
     def _note(self, found: NewVersion, known: dict[tuple[str, TileId], int]) -> None:
         """Emit a version that was not seen before."""

@@ -8,6 +8,7 @@ import click
 from gnd.deploy.watch import TileWatch
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.gnd_map.region import parse_region
 
@@ -29,5 +30,6 @@ def watch(region: str, connect: str, layers: tuple[str, ...], as_json: bool) -> 
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.signal(signal.SIGINT, lambda *_: stop.set())
     with open_bus(BusConfig(connect=(connect,)), name="watch") as bus:
+        follow_revoked(bus)
         click.echo(f"watching {chosen.prefix or 'the world'} on {connect}, Ctrl-C ends", err=True)
         TileWatch(bus, chosen, lambda event: click.echo(event.json() if as_json else event.line()), layers).run(stop)

@@ -41,10 +41,16 @@ SIZES: Final = {
 }
 """Bytes of a question on these keys that a router lets in: more than any of them may have, so that what is refused by
 name stays refused by name; a larger one is dropped before it is copied to anybody."""
-PUT_SIZES: Final = {"gnd/v1/traffic/**": 64 * KIB, "gnd/v1/want/**": 256 * KIB, "gnd/v1/update/**": 5 * 1024 * KIB}
+PUT_SIZES: Final = {
+    "gnd/v1/traffic/**": 64 * KIB,
+    "gnd/v1/health/**": 64 * KIB,
+    "gnd/v1/want/**": 256 * KIB,
+    "gnd/v1/update/**": 5 * 1024 * KIB,
+}
 """Likewise of messages that are put."""
 
 # Knocking at a router that is down costs some 100 bytes a time.
+_LISTEN_AGAIN_MS: Final = 20
 _RETRY_MS: Final = 200
 _RETRY_MOBILE_MS: Final = 1000
 # A client's own queue may be full for as long as its own weak link needs: it drops nothing itself.
@@ -75,6 +81,7 @@ class BusConfig:
         identity: identity folder (`gnd certs`), which "tls/" endpoints need; by default that of GND_IDENTITY. A client
             with one seals what it says, and demands seals of what it hears.
         rights: access control of a router (`rights.access_control`); empty: none.
+        takes_over: of a router: whether another session listens at its endpoints; it listens as soon as that ends.
     """
 
     mode: Literal["client", "router"] = "client"
@@ -86,6 +93,7 @@ class BusConfig:
     patient: bool = False
     identity: Path | None = field(default_factory=identity_of_environment)
     rights: Mapping[str, Any] = field(default_factory=dict)
+    takes_over: bool = False
 
     def __post_init__(self) -> None:
         if self.mode not in ("client", "router"):
@@ -200,6 +208,9 @@ def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         settings |= _tls(config.identity)
     if config.rights:
         settings["access_control"] = dict(config.rights)
+    if config.takes_over:
+        retry = {"period_init_ms": _LISTEN_AGAIN_MS, "period_max_ms": _LISTEN_AGAIN_MS, "period_increase_factor": 1.0}
+        settings |= {"listen/exit_on_failure": False, "listen/timeout_ms": -1, "listen/retry": retry}
     return settings | _patience(config)
 
 

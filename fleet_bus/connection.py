@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Self
 import zenoh
 
 from gnd.fleet_bus.config import MAX_MESSAGE_BYTES, BusConfig, zenoh_config
+from gnd.fleet_bus.envelopes import RECORD_BYTES
 from gnd.fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter, PortInUse
 from gnd.fleet_bus.ledger import Ledger, Share, SharesOf
 from gnd.fleet_bus.pacer import Pacer
@@ -52,6 +53,7 @@ class Connection:
         self.sealing = Sealing.of_folder(config.identity) if seals and config.identity is not None else None
         self.meter = WireMeter(config.lease_ms or config.link_profile.lease_ms)
         self._pacer = Pacer(config.link_profile, self.closed)
+        self._record_bytes = RECORD_BYTES if config.identity is not None and _is_tls(config.connect) else 0
         self._pid = os.getpid()
         self._calls = 0
         self._idle = threading.Condition()
@@ -193,7 +195,7 @@ class Connection:
             raise MessageTooLarge(f"a {kind} message has {len(payload)} bytes, the limit is {MAX_MESSAGE_BYTES}")
         self._pacer.wait("up", len(payload))
         if self.ledger is not None:
-            self.ledger.record("up", kind, len(payload), tile, head_bytes=head_bytes)
+            self.ledger.record("up", kind, len(payload), tile, head_bytes=head_bytes + self._record_bytes)
 
     def incoming(
         self,
@@ -225,6 +227,7 @@ class Connection:
         shares = shares_of(payload) if shares_of is not None else ()
         took_s = None if asked_at_s is None else time.monotonic() - asked_at_s
         shares = shares or (Share(kind, len(payload), tile),)
+        head_bytes += self._record_bytes * (1 if asked_at_s is None else 2)  # the end of an answer has one of its own
         self.ledger.record_shares("down", shares, head_bytes=head_bytes, took_s=took_s)
 
     @contextmanager

@@ -16,6 +16,8 @@ NOTICE_BYTES: Final = 12
 """Around a put."""
 ATTACHMENT_BYTES: Final = 2
 """Around an attachment."""
+RECORD_BYTES: Final = 22
+"""Around what is sent at once over TLS 1.3: a header, a type and a tag."""
 
 
 def head_bytes(key: str, envelope_bytes: int) -> int:

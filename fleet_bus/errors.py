@@ -11,6 +11,7 @@ BusError
 ├── RequestFailed       no answer before the deadline
 │   └── RequestRefused  the other side answered: never
 ├── SealError           a message whose seal is missing, does not fit or is of the wrong part
+│   └── NotAnsweredFor  a tile version that no publisher answers for
 ├── NotMine, Refused, Busy
 │                       raised by handlers: what they say to the asker
 └── LedgerError         a ledger file or run folder that cannot be read
@@ -76,6 +77,19 @@ class RequestRefused(RequestFailed):
 
 class SealError(BusError):
     """A message is not sealed, or not by who may say it; a certificate is not one of the authority."""
+
+
+class NotAnsweredFor(SealError):
+    """A tile version that no publisher answers for.
+
+    Attributes:
+        why: unsigned, wrong (the signature does not fit), revoked (its signer's certificate was), expired (it did not
+            hold when it was signed), foreign (of another authority or role) or unknown (nobody shows the certificate).
+    """
+
+    def __init__(self, why: str, text: str) -> None:
+        super().__init__(text)
+        self.why = why
 
 
 class NotMine(BusError):

@@ -5,6 +5,9 @@ session in this process, which takes over the listening ports, while the old one
 is linked with the new one over a Unix socket: nobody is interrupted, and who comes, comes to the new rights. A revoked
 member is cut off by its sockets; its listening ports are closed before, so that it finds no way back to the old rights.
 (Linux: sockets are found in /proc.)
+
+While two sessions link up, zenoh (1.10) may lose what a client declares at one of them: nobody at the other would ever
+reach it. So the new session listens only when its links have settled, and who connected shortly before connects anew.
 """
 
 import contextlib
@@ -13,7 +16,9 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, Self
 
@@ -21,22 +26,26 @@ import zenoh
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
-from gnd.fleet_bus.errors import BusConfigError, IdentityError, PortInUse
+from gnd.fleet_bus.errors import BusConfigError, IdentityError
 from gnd.fleet_bus.guard import USUAL_LIMITS, Address, ConnectionGuard, address
 from gnd.fleet_bus.identity.folder import MEMBERS, MemberIdentity
 from gnd.fleet_bus.identity.following import take_revoked
 from gnd.fleet_bus.identity.lists import MemberList, replace_file
 from gnd.fleet_bus.identity.renewal import CertificateWatch
 from gnd.fleet_bus.rights import AUTHORITY_KEYS, access_control
-from gnd.fleet_bus.sockets import Ends, address_of, cut, stop_listening
+from gnd.fleet_bus.sockets import Ends, address_of, cut, is_listening, stop_listening
 from gnd.fleet_bus.subscribing import OnMessage
 
 LOOK_S: Final = 0.5
 """How often the list of members and the links are looked at."""
 GENERATIONS: Final = 3
 """So many router sessions keep their clients; those of an older one are sent to the newest."""
-_TRIES: Final = 40
-_TRY_S: Final = 0.05
+_SETTLE_S: Final = 0.5
+"""From a link between sessions to its use: zenoh computes its routes 0.1 s after the link has come."""
+FRESH_LOOKS: Final = 4
+"""Who has come since so many looks may not have declared everything yet."""
+_TAKEN_OVER_S: Final = 5.0
+_POLL_S: Final = 0.01
 _SAY_S: Final = 60.0
 _LOG = logging.getLogger(__name__)
 
@@ -69,6 +78,7 @@ class SecureRouter:
         self._heard: bytes | None = None
         self._refused = b""
         self._said_s: dict[str, float] = {}
+        self._looks: deque[set[Ends]] = deque([set()], FRESH_LOOKS)
         self._guard: ConnectionGuard | None = None
         self._sockets = Path(tempfile.mkdtemp(prefix="gnd-router-"))  # mode 0700: nobody else's
         self.certificate = CertificateWatch(identity, lambda _new: self._on_renewed(), "router")
@@ -172,6 +182,10 @@ class SecureRouter:
                 if not old.links():
                     self._generations.remove(old)
                     old.close()
+            self._looks.append(self._clients())
+
+    def _clients(self) -> set[Ends]:
+        return {_ends(link) for one in self._generations for link in one.links()}
 
     def _cut_revoked(self) -> None:
         """Ends the connections of who does not belong, and of who came before its rights did: it comes again."""
@@ -207,12 +221,29 @@ class SecureRouter:
                 identity=self._folder,
                 rights=access_control(members, links=True),
             )
-            if self._generations:
-                stop_listening(self._ports)
-            bus = _opened(config, takes_over=bool(self._generations))
+            holds_ports = is_listening(self._ports)  # not after a revocation, nor at the start
+            bus = open_bus(replace(config, takes_over=holds_ports), name="router")
             self._generations.append(_Generation(bus, socket, self._names(), self._on_list))
+            self._settle(holds_ports)
             for old in self._generations[:-GENERATIONS]:
                 cut({_ends(link) for link in old.links()})  # its clients come to the newest; then it is closed
+
+    def _settle(self, holds_ports: bool) -> None:
+        """Lets the newest session listen once it knows what the clients of all others have declared; who came while
+        they linked up comes again.
+        """
+        *others, new = self._generations
+        if not others:
+            return
+        if not _wait(lambda: new.routers() >= {one.router_id for one in others}):
+            _LOG.warning("the sessions of this router do not find each other: what is served at one is not at all")
+        time.sleep(_SETTLE_S)
+        fresh = self._clients() - self._looks[0]
+        if holds_ports:
+            stop_listening(self._ports)
+        if not _wait(lambda: is_listening(self._ports)):
+            _LOG.warning("port %s is not free: trying on", ", ".join(map(str, sorted(self._ports))))
+        cut(fresh)
 
     def _on_renewed(self) -> None:
         with self._lock:
@@ -267,7 +298,12 @@ class _Generation:
 
     def __init__(self, bus: Bus, socket: str, names: frozenset[str], on_list: OnMessage) -> None:
         self.bus, self.socket, self.names = bus, socket, names
+        self.router_id = str(bus.connection.session.info.zid())
         bus.subscribe(AUTHORITY_KEYS, on_list, kind="control")
+
+    def routers(self) -> set[str]:
+        """Ids of the router sessions that it is linked with."""
+        return {str(one) for one in self.bus.connection.session.info.routers_zid()}
 
     def links(self) -> list[zenoh.Link]:
         """Its connections to others, without those to other generations."""
@@ -278,14 +314,14 @@ class _Generation:
         self.bus.close()
 
 
-def _opened(config: BusConfig, *, takes_over: bool) -> Bus:
-    """The session; a port that was just given free may need a moment."""
-    for _ in range(_TRIES if takes_over else 0):
-        try:
-            return open_bus(config, name="router")
-        except PortInUse:
-            threading.Event().wait(_TRY_S)
-    return open_bus(config, name="router")
+def _wait(condition: Callable[[], bool]) -> bool:
+    """Whether it came true in time."""
+    deadline_s = time.monotonic() + _TAKEN_OVER_S
+    while not condition():
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(_POLL_S)
+    return True
 
 
 def _is_ip(link: zenoh.Link) -> bool:

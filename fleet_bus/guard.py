@@ -6,6 +6,7 @@ names the connections that are sessions; all other sockets at the router's own p
 
 import ipaddress
 import logging
+import math
 import os
 import socket
 import stat
@@ -13,7 +14,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -59,12 +60,15 @@ USUAL_LIMITS: Final = GuardLimits(handshake_s=5.0, handshakes=256, of_address=4_
 
 @dataclass(frozen=True, slots=True)
 class SeenConnection:
-    """A connection: its descriptor, the inode of its socket, the other side, and since when it is known, s."""
+    """A connection: its descriptor, the inode of its socket, the other side, since when it is known, s, and when it was
+    last seen to be a session, s.
+    """
 
     descriptor: int
     inode: int
     peer: Address
     since_s: float
+    session_s: float = -math.inf
 
 
 def to_close(
@@ -82,7 +86,7 @@ def to_close(
     going: dict[int, tuple[SeenConnection, str]] = {}
     handshakes = [one for one in ordered if one.peer not in sessions]
     for one in handshakes:
-        if now_s - one.since_s > limits.handshake_s:
+        if now_s - max(one.since_s, one.session_s) > limits.handshake_s:
             going[one.inode] = one, "handshake"
     young = [one for one in handshakes if one.inode not in going]
     of_host = Counter(one.peer[0] for one in young)
@@ -133,8 +137,12 @@ class ConnectionGuard:
     def look(self) -> int:
         """Close what is beyond the limits; how many those were."""
         self._refresh()
+        sessions, now_s = self._sessions(), time.monotonic()
+        for at, one in self._seen.items():
+            if isinstance(one, SeenConnection) and one.peer in sessions:
+                self._seen[at] = replace(one, session_s=now_s)  # one that zenoh has just given up has time, too
         mine = [one for one in self._seen.values() if isinstance(one, SeenConnection)]
-        going = to_close(mine, self._sessions(), self._limits, time.monotonic())
+        going = to_close(mine, sessions, self._limits, now_s)
         ended = Counter((one.peer[0], reason) for one, reason in going if _shut(one))
         for (host, reason), n in ended.items():
             counted("connection", reason, n)

@@ -19,6 +19,7 @@ from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, attachment_bytes, head_bytes
 from gnd.fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused, SealError
 from gnd.fleet_bus.ledger import SharesOf
+from gnd.fleet_bus.sealing import SealedQuestion
 from gnd.gnd_map.tile_id import TileId
 
 END_OF_ANSWERS: Final = "gnd/end"
@@ -29,6 +30,8 @@ REFUSED: Final = "gnd/refused"
 """Encoding of a reply that says: do not ask again."""
 CERTIFICATE_WANTED: Final = "gnd/certificate"
 """Encoding of a reply that says: ask again at once, with your certificate."""
+SIGNATURE_WANTED: Final = "gnd/sign"
+"""Encoding of a reply that says: ask again at once, signed; your short seal does not count here."""
 FAILED: Final = "gnd/failed"
 """Encoding of a reply that says: the handler failed, ask again."""
 BUSY: Final = "gnd/busy"
@@ -83,6 +86,7 @@ class RequestAnswers:
     refusal: str | None = None
     announced: int | None = None
     certificate_wanted: bool = False
+    signature_wanted: bool = False
     retry_after_s: float = 0.0
 
     def add_error(self, error: zenoh.ReplyError, *, final: bool = True) -> None:
@@ -95,6 +99,9 @@ class RequestAnswers:
         elif encoding == CERTIFICATE_WANTED:
             self.certificate_wanted = True
             self.errors.append(text)
+        elif encoding == SIGNATURE_WANTED:
+            self.signature_wanted = True
+            self.errors.append("a signature is wanted")
         elif encoding == BUSY:
             wait_s, why = _busy_of(text)
             self.retry_after_s = max(self.retry_after_s, wait_s)
@@ -170,12 +177,17 @@ class _Asking:
         Raises:
             RequestFailed, RequestRefused, BusClosed.
         """
-        deadline_s, with_chain = time.monotonic() + timeout_s, False
+        deadline_s, with_chain, short = time.monotonic() + timeout_s, False, True
         for attempt in itertools.count(1):
             left_s = max(deadline_s - time.monotonic(), 0.001)
-            answers = self._once(min(left_s, retry.attempt_timeout_s), first_only=first_only, with_chain=with_chain)
+            answers = self._once(
+                min(left_s, retry.attempt_timeout_s), first_only=first_only, with_chain=with_chain, short=short
+            )
             if good(answers):
                 return answers
+            was_short, short = short, short and bool(answers.retry_after_s)
+            if answers.signature_wanted and was_short:
+                continue
             if answers.certificate_wanted and not with_chain:
                 with_chain = True
                 continue
@@ -189,7 +201,7 @@ class _Asking:
                 raise BusClosed(f"the bus was closed while asking {self.key} for the {attempt + 1}th time")
         raise AssertionError("unreachable")
 
-    def _once(self, timeout_s: float, *, first_only: bool, with_chain: bool) -> RequestAnswers:
+    def _once(self, timeout_s: float, *, first_only: bool, with_chain: bool, short: bool) -> RequestAnswers:
         connection = self.connection
         connection.check_open()
         was_connected = connection.is_connected()
@@ -198,12 +210,12 @@ class _Asking:
         if not was_connected and connection.closed.wait(random.uniform(0.0, min(RETURN_SPREAD_S, timeout_s / 2))):
             raise BusClosed(f"the bus was closed while asking {self.key}")
         asked_at_s = time.monotonic()
-        attachment, digest = None if first_only else COUNT_WANTED, b""
+        attachment, sealed = None if first_only else COUNT_WANTED, None
         if connection.sealing is not None:
             sealed = connection.sealing.question(
-                self.key, self.payload, count_wanted=not first_only, with_chain=with_chain
+                self.key, self.payload, count_wanted=not first_only, with_chain=with_chain, short=short
             )
-            attachment, digest = sealed.attachment, sealed.digest
+            attachment = sealed.attachment
         head = head_bytes(self.key, REQUEST_BYTES) + attachment_bytes(attachment)
         connection.outgoing(self.payload, self.kind, self.tile, head)
         inbox: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
@@ -222,12 +234,20 @@ class _Asking:
                 cancellation_token=cancel,
             )
         try:
-            return self._collect(inbox, asked_at_s, digest, first_only=first_only)
+            answers = self._collect(inbox, asked_at_s, sealed, first_only=first_only)
         finally:
             cancel.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub
+        if sealed is not None and connection.sealing is not None:
+            connection.sealing.ended(self.key, sealed, signature_wanted=answers.signature_wanted)
+        return answers
 
     def _collect(
-        self, inbox: "queue.SimpleQueue[zenoh.Reply | None]", asked_at_s: float, digest: bytes, *, first_only: bool
+        self,
+        inbox: "queue.SimpleQueue[zenoh.Reply | None]",
+        asked_at_s: float,
+        sealed: SealedQuestion | None,
+        *,
+        first_only: bool,
     ) -> RequestAnswers:
         answers = RequestAnswers()
         while (reply := self._receive(inbox)) is not None:
@@ -244,7 +264,7 @@ class _Asking:
                 head_bytes=head_bytes(key, REPLY_BYTES) + attachment_bytes(reply.ok.attachment),
                 asked_at_s=asked_at_s,
             )
-            if self._counts(reply.ok, key, payload, digest, answers):
+            if self._counts(reply.ok, key, payload, sealed, answers):
                 answers.ok.append((key, payload))
             if first_only and (answers.ok or answers.refusal is not None):
                 break
@@ -254,14 +274,16 @@ class _Asking:
         """Whether an error without a seal may end the request."""
         return self.connection.sealing is None or self.connection.sealing.answers_are_bare(self.key)
 
-    def _counts(self, sample: zenoh.Sample, key: str, payload: bytes, digest: bytes, answers: RequestAnswers) -> bool:
+    def _counts(
+        self, sample: zenoh.Sample, key: str, payload: bytes, sealed: SealedQuestion | None, answers: RequestAnswers
+    ) -> bool:
         """Whether an answer is one; notes a refusal, and what has no good seal."""
         sealing = self.connection.sealing
-        if sealing is None:
+        if sealing is None or sealed is None:
             return True
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
         try:
-            if not sealing.check_answer(self.key, key, payload, attachment, digest):
+            if not sealing.check_answer(self.key, key, payload, attachment, sealed):
                 return True
             answers.refusal = payload.decode(errors="replace")
         except SealError as error:

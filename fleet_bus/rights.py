@@ -30,6 +30,7 @@ _CERTIFICATES: Final = (f"{_V1}/certificate/*",)
 """Certificates that seals name; they prove themselves."""
 AUTHORITY_KEYS: Final = f"{_V1}/authority/*"
 """Where the lists of an authority are put: members, revoked. They are signed."""
+REVOKED_KEY: Final = f"{_V1}/authority/revoked"
 _EVERYTHING: Final = ("**", "**/@adv/**")
 _ALL: Final = (
     "put",
@@ -97,7 +98,7 @@ _RECALLS: Final = (*_hears(*_RECALL), *_asks(*_RECALL), *_sees_alive(*_RECALL))
 ROLE_RIGHTS: Final[dict[str, tuple[Right, ...]]] = {
     "vehicle": (
         *_asks(*_MAP, *_CHANGES, *_CERTIFICATES),
-        *_hears(*_UPDATES),
+        *_hears(*_UPDATES, REVOKED_KEY),
         *_RECALLS,
         Right(("put",), _WANTS, ("egress",)),
         Right(("reply", "declare_queryable"), _STATES, ("egress",)),
@@ -117,7 +118,7 @@ ROLE_RIGHTS: Final[dict[str, tuple[Right, ...]]] = {
     "tiles": (*_answers(*_MAP, *_CERTIFICATES), *_hears(AUTHORITY_KEYS)),
     "operator": (
         *_asks(*_MAP, *_CERTIFICATES),
-        *_hears(*_UPDATES, *_TRAFFIC, *_HEALTH),
+        *_hears(*_UPDATES, *_TRAFFIC, *_HEALTH, REVOKED_KEY),
         *_RECALLS,
         *_sees_alive(*_ALIVE),
         *_puts(AUTHORITY_KEYS),

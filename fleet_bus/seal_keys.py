@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from gnd.fleet_bus.errors import IdentityError, SealError
+from gnd.fleet_bus.remembered import FILE, RememberedChains
 from gnd.fleet_bus.seals import Holder, Signer, certificate_id
 
 if TYPE_CHECKING:
@@ -29,10 +30,13 @@ class KnownCertificates:
     Args:
         authority: certificates that are trusted.
         revoked: file with the authority's list of revoked certificates (PEM); it may come later, and change.
+        remembered: certificates of an earlier start.
     """
 
-    def __init__(self, authority: Sequence["x509.Certificate"], revoked: Path) -> None:
-        self._authority, self._revoked_path = tuple(authority), revoked
+    def __init__(
+        self, authority: Sequence["x509.Certificate"], revoked: Path, remembered: RememberedChains | None = None
+    ) -> None:
+        self._authority, self._revoked_path, self._remembered = tuple(authority), revoked, remembered
         self._lock = threading.Lock()
         self._known: OrderedDict[bytes, tuple[Holder, frozenset[int]]] = OrderedDict()
         self._revoked: frozenset[int] = frozenset()
@@ -44,6 +48,9 @@ class KnownCertificates:
         Raises:
             SealError: it has ended, or was revoked.
         """
+        return self._holder(certificate_id) or self._recall(certificate_id)
+
+    def _holder(self, certificate_id: bytes) -> Holder | None:
         with self._lock:
             found = self._known.get(certificate_id)
             if found is None:
@@ -63,18 +70,28 @@ class KnownCertificates:
         Raises:
             SealError: the authority has not signed it, it is not valid now, or was revoked.
         """
-        certificates = certificates_of(chain)
-        _check_chain(certificates, self._authority)
-        holder = holder_of(certificates[0])
-        serials = frozenset(one.serial_number for one in certificates)
+        holder, serials = holder_of_chain(chain, self._authority)
         with self._lock:
             self._known[holder.certificate_id] = (holder, serials)
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
-        known = self.holder(holder.certificate_id)
+        if self._remembered is not None:
+            self._remembered.add(holder.certificate_id, chain)
+        known = self._holder(holder.certificate_id)
         if known is None:
             raise SealError(f"the certificate of {holder} was forgotten at once: {REMEMBERED} others came meanwhile")
         return known
+
+    def _recall(self, certificate_id: bytes) -> Holder | None:
+        """One that an earlier start has learnt, if it is still good; else it is to be shown again."""
+        chain = None if self._remembered is None else self._remembered.get(certificate_id)
+        if chain is None or self._remembered is None:
+            return None
+        try:
+            return self.learn(chain)
+        except SealError:
+            self._remembered.drop(certificate_id)
+            return None
 
     def _look_for_list(self) -> None:
         """Read the list again where its file has changed; a list that is older or not the authority's is no list."""
@@ -112,12 +129,30 @@ def certificates_of(chain: bytes) -> list["x509.Certificate"]:
             raise SealError(f"a chain of certificates with {len(chain)} bytes left cannot be read")
         try:
             found.append(x509.load_der_x509_certificate(chain[2 : 2 + size]))
-        except ValueError as error:
+        except (ValueError, x509.InvalidVersion) as error:
             raise SealError(f"certificate {len(found) + 1} of a chain cannot be read: {error}") from None
         chain = chain[2 + size :]
     if not found:
         raise SealError("a chain without certificates")
     return found
+
+
+def holder_of_chain(chain: bytes, authority: Sequence["x509.Certificate"]) -> tuple[Holder, frozenset[int]]:
+    """Whom a chain of certificates names, and their serial numbers.
+
+    Raises:
+        SealError: it cannot be read, the authority has not signed it, it is not valid now, or names no part of a fleet.
+    """
+    from cryptography import x509
+    from cryptography.exceptions import UnsupportedAlgorithm
+
+    broken = ValueError, TypeError, UnsupportedAlgorithm, x509.DuplicateExtension, x509.UnsupportedGeneralNameType
+    certificates = certificates_of(chain)
+    try:  # the parts of a certificate are read when they are asked for
+        _check_chain(certificates, authority)
+        return holder_of(certificates[0]), frozenset(one.serial_number for one in certificates)
+    except broken as error:
+        raise SealError(f"a certificate of a chain cannot be read: {error}") from None
 
 
 def holder_of(certificate: "x509.Certificate") -> Holder:
@@ -126,6 +161,7 @@ def holder_of(certificate: "x509.Certificate") -> Holder:
     Raises:
         SealError: it names no part of a fleet, or its key is none on P-256.
     """
+    from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.hazmat.primitives.serialization import Encoding
     from cryptography.x509.oid import NameOID
@@ -134,12 +170,15 @@ def holder_of(certificate: "x509.Certificate") -> Holder:
         values = [str(attribute.value) for attribute in certificate.subject.get_attributes_for_oid(oid)]
         return values[0] if len(values) == 1 else ""
 
-    common = said(NameOID.COMMON_NAME)
+    try:  # its parts are read when they are asked for
+        common, owner = said(NameOID.COMMON_NAME), said(NameOID.ORGANIZATION_NAME)
+    except (ValueError, TypeError) as error:
+        raise SealError(f"the name in a certificate cannot be read: {error}") from None
     role, _, name = common.partition(".")
     try:
         key = certificate.public_key()
-    except ValueError as error:
-        raise SealError(f"the key of certificate {common!r} cannot be read: {error}") from None
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise SealError(f"the key of certificate {common[:80]!r} cannot be read: {error}") from None
     if not role or not name or not isinstance(key, ec.EllipticCurvePublicKey):
         raise SealError(f"certificate {common[:80]!r} names no part of a fleet")
     if not isinstance(key.curve, ec.SECP256R1):
@@ -147,7 +186,7 @@ def holder_of(certificate: "x509.Certificate") -> Holder:
     return Holder(
         role=role,
         name=name,
-        owner=said(NameOID.ORGANIZATION_NAME),
+        owner=owner,
         certificate_id=certificate_id(certificate.public_bytes(Encoding.DER)),
         ends_s=certificate.not_valid_after_utc.timestamp(),
         public_key=key,
@@ -162,15 +201,16 @@ def _check_chain(chain: Sequence["x509.Certificate"], authority: Sequence["x509.
         if not begins_s <= now_s <= ends_s:
             late = "has ended" if now_s > ends_s else "is not valid yet: check the clocks"
             raise SealError(f"a certificate of {one.subject.rfc4514_string()[:120]} {late}")
-        if (position > 0) != _may_sign(one):
+        if (position > 0) != may_sign(one):
             raise SealError(f"{one.subject.rfc4514_string()[:120]} has another place in the chain")
     links = pairwise(chain)
     last = chain[-1]
-    if not all(_is_signed_by(one, by) for one, by in links) or not any(_is_signed_by(last, by) for by in authority):
+    if not all(is_signed_by(one, by) for one, by in links) or not any(is_signed_by(last, by) for by in authority):
         raise SealError(f"the certificate of {chain[0].subject.rfc4514_string()[:120]} is not of our authority")
 
 
-def _may_sign(certificate: "x509.Certificate") -> bool:
+def may_sign(certificate: "x509.Certificate") -> bool:
+    """Whether a certificate is of an authority."""
     from cryptography import x509
 
     try:
@@ -179,7 +219,8 @@ def _may_sign(certificate: "x509.Certificate") -> bool:
         return False
 
 
-def _is_signed_by(certificate: "x509.Certificate", by: "x509.Certificate") -> bool:
+def is_signed_by(certificate: "x509.Certificate", by: "x509.Certificate") -> bool:
+    """Whether `by` has signed a certificate."""
     from cryptography.exceptions import InvalidSignature
 
     try:
@@ -240,8 +281,7 @@ def load_authority(folder: Path) -> KnownCertificates:
     from cryptography import x509
 
     try:
-        return KnownCertificates(
-            x509.load_pem_x509_certificates((folder / "authority.pem").read_bytes()), folder / "revoked.pem"
-        )
+        authority = x509.load_pem_x509_certificates((folder / "authority.pem").read_bytes())
+        return KnownCertificates(authority, folder / "revoked.pem", RememberedChains(folder / FILE))
     except (OSError, ValueError) as error:
         raise IdentityError(f"identity {folder}: {error}") from None

@@ -3,6 +3,7 @@
 A part with an identity demands seals by the tables of `seals`; a part without one neither makes nor looks at any.
 """
 
+import contextlib
 import logging
 import threading
 import time
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
+from gnd.fleet_bus.agreed_keys import AgreedKey, GrantedKeys, HeldKeys, KeyHalf
 from gnd.fleet_bus.errors import BusError, NotMine, SealError
 from gnd.fleet_bus.seal_keys import KnownCertificates, certificates_of, holder_of, load_authority, load_signer
 from gnd.fleet_bus.seals import (
@@ -20,12 +22,14 @@ from gnd.fleet_bus.seals import (
     MARK,
     NOTICED_BY,
     OWN_NAME,
+    TO_ONE,
     Holder,
     Seal,
     Signer,
     check_signature,
     question_digest,
 )
+from gnd.fleet_bus.short_seals import ShortSeal, is_short
 
 if TYPE_CHECKING:
     from gnd.fleet_bus.serving import Request
@@ -45,12 +49,42 @@ class CertificateWanted(SealError):
     """A question whose certificate is not known here: the asker sends it along with the next attempt."""
 
 
+class SignatureWanted(SealError):
+    """A question with a short seal that does not count here: the asker signs the next attempt."""
+
+
 @dataclass(frozen=True, slots=True)
 class SealedQuestion:
-    """A question as it goes out: its attachment, and what its answers must be bound to."""
+    """A question as it goes out.
+
+    Attributes:
+        attachment: its seal.
+        digest: what its answers must be bound to.
+        agreed: the key of a short seal; None = the question is signed, or has a number alone.
+        half: of a key that it offers; None = none.
+    """
 
     attachment: bytes
     digest: bytes
+    agreed: AgreedKey | None = None
+    half: KeyHalf | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class HeardQuestion:
+    """A question that counts.
+
+    Attributes:
+        asker: who asks, where that matters.
+        digest: what the answers are to be bound to.
+        agreed: the key of its short seal, by which it is answered; None = the answer is signed.
+        share: half of a key that it offers.
+    """
+
+    asker: Holder | None
+    digest: bytes
+    agreed: AgreedKey | None = None
+    share: bytes = b""
 
 
 class Sealing:
@@ -74,6 +108,7 @@ class Sealing:
         self._nonces: OrderedDict[bytes, float] = OrderedDict()
         self._in_vain: dict[bytes, float] = {}
         self._said_s = -SAY_S
+        self._held, self._granted = HeldKeys(), GrantedKeys()
 
     @classmethod
     def of_folder(cls, folder: Path) -> Self:
@@ -91,6 +126,8 @@ class Sealing:
         signer = load_signer(folder)
         self.own = holder_of(certificates_of(signer.chain)[0])
         self._signers = (signer, *self._signers[:1])
+        self._held.clear()  # they are bound to the certificate before
+        self._granted.clear()
 
     @property
     def _signer(self) -> Signer:
@@ -107,22 +144,55 @@ class Sealing:
                 return signer.chain
         raise NotMine
 
-    def question(self, key: str, payload: bytes, *, count_wanted: bool, with_chain: bool) -> SealedQuestion:
-        """Seal a question."""
-        seal = self._signer.question(key, payload, count_wanted=count_wanted, with_chain=with_chain)
-        return SealedQuestion(seal.encode(), question_digest(key, payload, seal.nonce))
+    def question(
+        self, key: str, payload: bytes, *, count_wanted: bool, with_chain: bool, short: bool = True
+    ) -> SealedQuestion:
+        """Seal a question.
 
-    def answer(self, key: str, payload: bytes, digest: bytes, *, refusal: bool = False) -> bytes:
-        """Seal an answer."""
-        return self._signer.answer(key, payload, digest, refusal=refusal).encode()
+        Args:
+            key: that is asked.
+            payload: of the question.
+            count_wanted: the number of answers is wanted at their end: several parts may answer.
+            with_chain: send the own certificates along.
+            short: a short seal will do, where there is a key for it.
+        """
+        role, half = None if count_wanted else ANSWERED_BY.get(_chunk(key, 2)), None
+        if role is not None and short:
+            agreed = self._held.to_use(key, role)
+            if agreed is not None and self._is_good(agreed):
+                seal = agreed.question(key, payload, is_bare=_chunk(key, 2) not in ASKED_BY)
+                return SealedQuestion(seal.encode(), question_digest(key, payload, seal.head), agreed)
+        if role is not None and self._held.may_offer(role):
+            half = KeyHalf.make()
+        signed = self._signer.question(
+            key, payload, count_wanted=count_wanted, with_chain=with_chain, share=b"" if half is None else half.share
+        )
+        return SealedQuestion(signed.encode(), question_digest(key, payload, signed.number), None, half)
+
+    def answer(self, key: str, payload: bytes, heard: HeardQuestion, *, refusal: bool = False) -> bytes:
+        """Seal an answer: in short where the question was; else signed, with half of a key if one was offered."""
+        if heard.agreed is not None:
+            return heard.agreed.answer(key, payload, heard.digest, refusal=refusal).encode()
+        share = b""
+        if heard.share and not refusal:
+            share = self._granted.grant(heard.share, heard.digest, self.own, heard.asker)
+        return self._signer.answer(key, payload, heard.digest, refusal=refusal, share=share).encode()
 
     def notice(self, key: str, payload: bytes) -> bytes:
-        """Seal a notice."""
+        """Seal a notice: signed, but for one to a single member with whom there is a key."""
+        agreed = self._granted.of_name(_chunk(key, 3)) if _chunk(key, 2) in TO_ONE else None
+        if agreed is not None and self._is_good(agreed):
+            return agreed.notice(key, payload).encode()
         return self._signer.notice(key, payload).encode()
 
-    def check_question(
-        self, key: str, payload: bytes, attachment: bytes, handler: int = 0
-    ) -> tuple[Holder | None, bytes]:
+    def ended(self, key: str, sealed: SealedQuestion, *, signature_wanted: bool) -> None:
+        """A question has got all its answers. `signature_wanted`: who answers there has no use for its key."""
+        if sealed.half is not None:
+            self._held.offer_ended(ANSWERED_BY.get(_chunk(key, 2), ""))
+        if sealed.agreed is not None and signature_wanted:
+            self._held.forget(key, sealed.agreed)
+
+    def check_question(self, key: str, payload: bytes, attachment: bytes, handler: int = 0) -> HeardQuestion:
         """Who asks, where that matters, and what the answers are to be bound to.
 
         Args:
@@ -133,19 +203,23 @@ class Sealing:
 
         Raises:
             CertificateWanted: the certificate is not known here.
+            SignatureWanted: its short seal does not count.
             SealError: the question does not count.
         """
+        if is_short(attachment):
+            try:
+                return self._check_short_question(key, payload, attachment, handler)
+            except SealError as error:
+                raise SignatureWanted(str(error)) from None
         wanted = ASKED_BY.get(_chunk(key, 2))
         if wanted is None and not attachment.startswith(MARK):
-            return None, question_digest(key, payload, b"")
+            return HeardQuestion(None, question_digest(key, payload, b""))
         seal = Seal.decode(attachment)
-        digest = question_digest(key, payload, seal.nonce)
-        if wanted is None and seal.what == "number":
-            return None, digest
-        if seal.what != "question":
+        digest = question_digest(key, payload, seal.number)
+        if seal.what not in ("question", "number") or (wanted is not None and seal.what == "number"):
             raise SealError(f"the seal of a {seal.what} on a question")
         if wanted is None:
-            return None, digest
+            return HeardQuestion(None, digest, share=seal.share)
         if abs(time.time() - seal.time_ms / 1000) > MOST_SKEW_S:
             raise SealError(
                 f"a question that was sealed {time.time() - seal.time_ms / 1000:.0f} s ago, the limit is"
@@ -156,9 +230,21 @@ class Sealing:
             raise CertificateWanted("certificate wanted")
         self._check(seal, holder, wanted, key, payload, b"")
         self._note_nonce(seal.certificate_id + seal.nonce + handler.to_bytes(8, "little"))
-        return holder, digest
+        return HeardQuestion(holder, digest, share=seal.share)
 
-    def check_answer(self, asked: str, key: str, payload: bytes, attachment: bytes, digest: bytes) -> bool:
+    def _check_short_question(self, key: str, payload: bytes, attachment: bytes, handler: int) -> HeardQuestion:
+        """As `check_question`; SealError where a signature would say more."""
+        seal, wanted = ShortSeal.decode(attachment), ASKED_BY.get(_chunk(key, 2))
+        agreed = self._granted.find(seal.key_id) if seal.what == "question" else None
+        if agreed is None or (wanted is not None and agreed.other is None):
+            raise SealError(f"the short seal of a {seal.what} under a key that is not known here")
+        agreed.check_question(seal, key, payload, handler, is_bare=wanted is None)
+        if agreed.other is not None:
+            self._check_end(agreed, wanted or agreed.other.role, key)
+        asker = None if wanted is None else agreed.other
+        return HeardQuestion(asker, question_digest(key, payload, seal.head), agreed)
+
+    def check_answer(self, asked: str, key: str, payload: bytes, attachment: bytes, sealed: SealedQuestion) -> bool:
         """Whether an answer to a question on `asked` is a refusal; it counts if this returns.
 
         Raises:
@@ -167,11 +253,36 @@ class Sealing:
         wanted = ANSWERED_BY.get(_chunk(asked, 2))
         if wanted is None:
             return False
+        if sealed.agreed is not None:  # a short question is too short to bind a signature to
+            return self._check_short_answer(asked, key, payload, attachment, sealed)
         seal = Seal.decode(attachment)
         if seal.what not in ("answer", "refusal"):
             raise SealError(f"the seal of a {seal.what} on an answer")
-        self._check(seal, self._holder(seal), wanted, key, payload, digest)
+        holder = self._holder(seal)
+        self._check(seal, holder, wanted, key, payload, sealed.digest)
+        if sealed.half is not None:
+            self._agree(asked, holder, seal, sealed, sealed.half)
         return seal.what == "refusal"
+
+    def _check_short_answer(
+        self, asked: str, key: str, payload: bytes, attachment: bytes, sealed: SealedQuestion
+    ) -> bool:
+        seal, agreed = ShortSeal.decode(attachment), sealed.agreed
+        if agreed is None or agreed.other is None or seal.what not in ("answer", "refusal"):
+            raise SealError(f"the short seal of a {seal.what} on an answer")
+        agreed.check_answer(seal, key, payload, sealed.digest)
+        self._check_end(agreed, ANSWERED_BY[_chunk(asked, 2)], key)
+        self._held.answered(asked, agreed.other)
+        return seal.what == "refusal"
+
+    def _agree(self, asked: str, part: Holder, seal: Seal, sealed: SealedQuestion, half: KeyHalf) -> None:
+        """Take the half of a key that an answer has brought; one that cannot be used only leaves things as they are."""
+        if not seal.share:
+            self._held.answered(asked, part)
+            return
+        asks = self.own if _chunk(asked, 2) in ASKED_BY else None
+        with contextlib.suppress(SealError):
+            self._held.add(asked, half.agree(seal.share, sealed.digest, part, asks, is_asker=True))
 
     def answers_are_bare(self, asked: str) -> bool:
         """Whether anybody may answer a question on this key."""
@@ -186,10 +297,37 @@ class Sealing:
         wanted = NOTICED_BY.get(_chunk(key, 2))
         if wanted is None:
             return
+        if is_short(attachment):
+            self._check_short_notice(wanted, key, payload, attachment)
+            return
         seal = Seal.decode(attachment)
         if seal.what != "notice":
             raise SealError(f"the seal of a {seal.what} on a notice")
         self._check(seal, self._holder(seal), wanted, key, payload, b"")
+
+    def _check_short_notice(self, wanted: str, key: str, payload: bytes, attachment: bytes) -> None:
+        seal = ShortSeal.decode(attachment)
+        if seal.what != "notice" or _chunk(key, 2) not in TO_ONE:
+            raise SealError(f"the short seal of a {seal.what} on a notice")
+        agreed = self._held.find(seal.key_id)
+        if agreed is None:
+            raise SealError("a notice under a key that is not known here")
+        agreed.check_notice(seal, key, payload)
+        self._check_end(agreed, wanted, key)
+
+    def _is_good(self, agreed: AgreedKey) -> bool:
+        """Whether the certificate of who has the other half still counts."""
+        try:
+            return agreed.other is not None and self._certificates.holder(agreed.other.certificate_id) is not None
+        except SealError:
+            return False
+
+    def _check_end(self, agreed: AgreedKey, role: str, key: str) -> None:
+        """Whether who has the other half of a key may say this."""
+        holder = None if agreed.other is None else self._certificates.holder(agreed.other.certificate_id)
+        if holder is None:
+            raise SealError("a short seal of somebody whose certificate is not known any more")
+        self._check_role(holder, role, key)
 
     def note_refused(self, key: str, error: BusError) -> None:
         """Count a message that was thrown away, and say so once a minute."""
@@ -202,11 +340,15 @@ class Sealing:
         _LOG.warning("%s: %d messages without a good seal until now, the last on %s: %s", self.own, total, key, error)
 
     def _check(self, seal: Seal, holder: Holder, role: str, key: str, payload: bytes, digest: bytes) -> None:
+        self._check_role(holder, role, key)
+        check_signature(seal, holder, key, payload, digest)
+
+    @staticmethod
+    def _check_role(holder: Holder, role: str, key: str) -> None:
         if holder.role != role:
             raise SealError(f"{holder} has sealed what a part in role {role} says")
         if _chunk(key, 2) in OWN_NAME and role == "vehicle" and _chunk(key, 3) != holder.name:
             raise SealError(f"{holder} speaks on the key of {_chunk(key, 3)[:80]}")
-        check_signature(seal, holder, key, payload, digest)
 
     def _holder(self, seal: Seal) -> Holder:
         """Whom the certificate of an answer or a notice names; one that is not known is asked for."""

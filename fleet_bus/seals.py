@@ -13,7 +13,7 @@ another client can invent, alter or repeat what matters. What may be withheld is
 
 import secrets
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final, Literal
@@ -34,6 +34,8 @@ NONCE_BYTES: Final = 8
 _TIME_BYTES: Final = 6
 _COUNT_WANTED: Final = 0x10
 _WITH_CHAIN: Final = 0x20
+_WITH_SHARE: Final = 0x40
+SHARE_BYTES: Final = 32
 _SIZES: Final[dict[What, tuple[int, int, int, int]]] = {
     "question": (ID_BYTES, _TIME_BYTES, NONCE_BYTES, SIGNATURE_BYTES),
     "answer": (ID_BYTES, 0, 0, SIGNATURE_BYTES),
@@ -55,6 +57,8 @@ ANSWERED_BY: Final = {
 }
 ASKED_BY: Final = {"change": "vehicle", "state": "vehicle"}
 NOTICED_BY: Final = {"update": "shard", "want": "shard"}
+TO_ONE: Final = frozenset({"want"})
+"""Notices to the member whose name is the fourth chunk of the key; all others are for everybody."""
 PUBLISHERS: Final = frozenset({"tiles", "shard"})
 """Roles whose certificates everybody asks for."""
 OWN_NAME: Final = frozenset({"state"})
@@ -88,6 +92,7 @@ class Seal:
         nonce: of a question, 8 bytes; else empty.
         count_wanted: of a question about a region: the number of answers is wanted at their end.
         chain: certificates of the signer as DER, each with its length (2 bytes) before it; empty = not sent along.
+        share: half of a key (`agreed_keys`), 32 bytes; empty = none is offered.
     """
 
     what: What
@@ -97,12 +102,28 @@ class Seal:
     nonce: bytes = b""
     count_wanted: bool = False
     chain: bytes = b""
+    share: bytes = b""
+
+    @property
+    def number(self) -> bytes:
+        """What the answers to a question are bound to, beside its key and payload."""
+        return self.nonce + self.share
 
     def encode(self) -> bytes:
         """The attachment."""
-        flags = _WHAT[self.what] | (_COUNT_WANTED if self.count_wanted else 0) | (_WITH_CHAIN if self.chain else 0)
+        flags = _WHAT[self.what] | (_COUNT_WANTED if self.count_wanted else 0)
+        flags |= (_WITH_CHAIN if self.chain else 0) | (_WITH_SHARE if self.share else 0)
         time_ms = self.time_ms.to_bytes(_TIME_BYTES, "little") if _SIZES[self.what][1] else b""
-        return MARK + bytes([flags]) + self.certificate_id + time_ms + self.nonce + self.signature + self.chain
+        return (
+            MARK
+            + bytes([flags])
+            + self.certificate_id
+            + time_ms
+            + self.nonce
+            + self.signature
+            + self.share
+            + self.chain
+        )
 
     @classmethod
     def decode(cls, data: bytes) -> "Seal":
@@ -115,15 +136,16 @@ class Seal:
             raise SealError("no seal")
         flags = data[len(MARK)]
         what = _WHAT_OF.get(flags & 0x0F)
-        if what is None or flags & ~(0x0F | _COUNT_WANTED | _WITH_CHAIN):
+        if what is None or flags & ~(0x0F | _COUNT_WANTED | _WITH_CHAIN | _WITH_SHARE):
             raise SealError(f"a seal with flags {flags:#x} is not known")
-        ends = list(accumulate(_SIZES[what], initial=len(MARK) + 1))
+        share_bytes = SHARE_BYTES if flags & _WITH_SHARE else 0
+        ends = list(accumulate((*_SIZES[what], share_bytes), initial=len(MARK) + 1))
         chain = data[ends[-1] :]
         if len(data) < ends[-1] or bool(chain) != bool(flags & _WITH_CHAIN) or len(chain) > MAX_CHAIN_BYTES:
             raise SealError(f"a seal of {len(data)} bytes, {ends[-1]} and at most {MAX_CHAIN_BYTES} more expected")
-        certificate_id, time_ms, nonce, signature = (data[begin:end] for begin, end in pairwise(ends))
-        count_wanted = bool(flags & _COUNT_WANTED)
-        return cls(what, certificate_id, int.from_bytes(time_ms, "little"), signature, nonce, count_wanted, chain)
+        certificate_id, time_ms, nonce, signature, share = (data[begin:end] for begin, end in pairwise(ends))
+        count_wanted, made_ms = bool(flags & _COUNT_WANTED), int.from_bytes(time_ms, "little")
+        return cls(what, certificate_id, made_ms, signature, nonce, count_wanted, chain, share)
 
     def signed_text(self, key: str, payload: bytes, question: bytes) -> bytes:
         """What is signed: everything but the chain, which proves itself."""
@@ -138,19 +160,22 @@ class Seal:
             len(self.nonce).to_bytes(1, "little") + self.nonce,
             len(question).to_bytes(1, "little") + question,
             sha256(payload).digest(),
+            self.share,
         )
         return b"".join(parts)
 
 
-def question_digest(key: str, payload: bytes, nonce: bytes) -> bytes:
+def question_digest(key: str, payload: bytes, number: bytes) -> bytes:
     """What an answer is bound to: the question, with the number that was used once (empty: asked without a seal)."""
-    return sha256(b"gnd question" + len(key).to_bytes(4, "little") + key.encode() + nonce + payload).digest()
+    name = key.encode()
+    parts = (len(one).to_bytes(4, "little") + one for one in (name, number, payload))
+    return sha256(b"gnd question 2" + b"".join(parts)).digest()
 
 
-def nonce_of(attachment: bytes) -> bytes:
+def number_of(attachment: bytes) -> bytes:
     """The number that a question was sealed with; empty where there is none."""
     try:
-        return Seal.decode(attachment).nonce
+        return Seal.decode(attachment).number
     except SealError:
         return b""
 
@@ -176,41 +201,32 @@ class Signer:
         self.certificate_id = certificate_id(chain[0])
         self.chain = b"".join(len(one).to_bytes(2, "little") + one for one in chain)
 
-    def question(self, key: str, payload: bytes, *, count_wanted: bool, with_chain: bool) -> Seal:
+    def question(self, key: str, payload: bytes, *, count_wanted: bool, with_chain: bool, share: bytes = b"") -> Seal:
         """The seal of a question; one that anybody may ask has a number alone."""
         nonce = secrets.token_bytes(NONCE_BYTES)
         chunks = key.split("/", 3)
         if len(chunks) > 2 and chunks[2] not in ASKED_BY:
-            return Seal("number", b"", 0, b"", nonce, count_wanted)
-        return self._seal("question", key, payload, b"", nonce, count_wanted, self.chain if with_chain else b"")
+            return Seal("number", b"", 0, b"", nonce, count_wanted, share=share)
+        chain, time_ms = self.chain if with_chain else b"", time.time_ns() // 1_000_000
+        blank = Seal("question", self.certificate_id, time_ms, b"", nonce, count_wanted, chain, share)
+        return self._signed(blank, key, payload, b"")
 
-    def answer(self, key: str, payload: bytes, question: bytes, *, refusal: bool = False) -> Seal:
+    def answer(self, key: str, payload: bytes, question: bytes, *, refusal: bool = False, share: bytes = b"") -> Seal:
         """The seal of an answer to that question."""
-        return self._seal("refusal" if refusal else "answer", key, payload, question)
+        blank = Seal("refusal" if refusal else "answer", self.certificate_id, 0, b"", share=share)
+        return self._signed(blank, key, payload, question)
 
     def notice(self, key: str, payload: bytes) -> Seal:
         """The seal of a notice."""
-        return self._seal("notice", key, payload, b"")
+        return self._signed(Seal("notice", self.certificate_id, 0, b""), key, payload, b"")
 
-    def _seal(
-        self,
-        what: What,
-        key: str,
-        payload: bytes,
-        question: bytes,
-        nonce: bytes = b"",
-        count_wanted: bool = False,
-        chain: bytes = b"",
-    ) -> Seal:
+    def _signed(self, blank: Seal, key: str, payload: bytes, question: bytes) -> Seal:
         from cryptography.hazmat.primitives import hashes
         from cryptography.hazmat.primitives.asymmetric import ec, utils
 
-        time_ms = time.time_ns() // 1_000_000 if what == "question" else 0
-        blank = Seal(what, self.certificate_id, time_ms, b"", nonce, count_wanted, chain)
         der = self._key.sign(blank.signed_text(key, payload, question), ec.ECDSA(hashes.SHA256()))
         r, s = utils.decode_dss_signature(der)
-        signature = r.to_bytes(32, "big") + s.to_bytes(32, "big")
-        return Seal(what, blank.certificate_id, blank.time_ms, signature, nonce, count_wanted, chain)
+        return replace(blank, signature=r.to_bytes(32, "big") + s.to_bytes(32, "big"))
 
 
 def certificate_id(certificate_der: bytes) -> bytes:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import zenoh
@@ -13,10 +13,20 @@ from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, attachment_bytes
 from gnd.fleet_bus.errors import BusClosed, BusError, Busy, NotMine, Refused, SealError
 from gnd.fleet_bus.part import Part
 from gnd.fleet_bus.refusals import counted
-from gnd.fleet_bus.requesting import BUSY, CERTIFICATE_WANTED, COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED, busy_text
-from gnd.fleet_bus.sealing import CertificateWanted
-from gnd.fleet_bus.seals import MARK, Holder, nonce_of, question_digest, wants_count
+from gnd.fleet_bus.requesting import (
+    BUSY,
+    CERTIFICATE_WANTED,
+    COUNT_WANTED,
+    END_OF_ANSWERS,
+    FAILED,
+    REFUSED,
+    SIGNATURE_WANTED,
+    busy_text,
+)
+from gnd.fleet_bus.sealing import CertificateWanted, HeardQuestion, SignatureWanted
+from gnd.fleet_bus.seals import MARK, Holder, number_of, question_digest, wants_count
 from gnd.fleet_bus.seldom import Seldom
+from gnd.fleet_bus.short_seals import is_short
 from gnd.fleet_bus.turns import InTurn
 
 _LOG = logging.getLogger(__name__)
@@ -118,6 +128,8 @@ class Serving(Part):
                 pass  # no reply: another handler gives it, or the asker tries again
             except CertificateWanted as error:
                 query.reply_err(str(error), encoding=CERTIFICATE_WANTED)
+            except SignatureWanted:
+                query.reply_err(b"", encoding=SIGNATURE_WANTED)
             except Busy as busy:
                 _say_busy(query, busy)
             except Refused as refusal:  # while a region's answers were made
@@ -134,52 +146,56 @@ class Serving(Part):
         attachment = query.attachment.to_bytes() if query.attachment is not None else b""
         head = head_bytes(key, REQUEST_BYTES) + attachment_bytes(query.attachment)
         self._connection.incoming(payload, self._kind, None, head_bytes=head)
-        asker, digest = None, b""
+        heard = HeardQuestion(None, b"")
         sealing = self._connection.sealing
         if sealing is not None:
             try:
-                asker, digest = sealing.check_question(key, payload, attachment, id(self))
+                heard = sealing.check_question(key, payload, attachment, id(self))
             except CertificateWanted:
                 raise
             except SealError as error:
                 sealing.note_refused(key, error)
-                self._refuse(query, key, str(error), question_digest(key, payload, nonce_of(attachment)), attachment)
+                if isinstance(error, SignatureWanted):
+                    raise
+                heard = HeardQuestion(None, question_digest(key, payload, number_of(attachment)))
+                self._refuse(query, key, str(error), heard, attachment)
                 return
-        request = Request(key, payload, asker)
+        request = Request(key, payload, heard.asker)
         try:
             answer = self._handler(request)
         except Refused as refusal:
-            self._refuse(query, key, str(refusal), digest, attachment)
+            self._refuse(query, key, str(refusal), heard, attachment)
             return
         if isinstance(answer, bytes):
-            self._send(query, request.key, answer, digest)
+            self._send(query, request.key, answer, heard)
             return
+        heard = replace(heard, share=b"")
         count = 0
         for count, (key, payload) in enumerate(answer, start=1):  # noqa: B007 - the last count is sent below
-            self._send(query, key, payload, digest)
+            self._send(query, key, payload, heard)
             self._connection.closed.wait(len(payload) / REGION_BYTE_S)
         # To a program that knows only zenoh an error would mean that its question had failed.
         if attachment == COUNT_WANTED or wants_count(attachment):
             query.reply_err(str(count), encoding=END_OF_ANSWERS)
 
-    def _refuse(self, query: zenoh.Query, key: str, why: str, digest: bytes, attachment: bytes) -> None:
+    def _refuse(self, query: zenoh.Query, key: str, why: str, heard: HeardQuestion, attachment: bytes) -> None:
         """Say that there will be no answer, sealed to who looks at seals."""
         counted("refused", self._kind)
         sealing = self._connection.sealing
-        if sealing is None or "*" in key or not attachment.startswith(MARK):
+        if sealing is None or "*" in key or not (attachment.startswith(MARK) or is_short(attachment)):
             query.reply_err(why, encoding=REFUSED)
             return
         payload = why.encode()
-        seal = sealing.answer(key, payload, digest, refusal=True)
+        seal = sealing.answer(key, payload, heard, refusal=True)
         self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES) + attachment_bytes(seal))
         with self._connection.sending():
             query.reply(key, payload, attachment=seal)
 
-    def _send(self, query: zenoh.Query, key: str, payload: bytes, digest: bytes) -> None:
+    def _send(self, query: zenoh.Query, key: str, payload: bytes, heard: HeardQuestion) -> None:
         if "*" in key:
             raise BusError(f"an answer needs a key without wildcards, got {key}: give (key, payload) pairs")
         sealing = self._connection.sealing
-        seal = None if sealing is None else sealing.answer(key, payload, digest)
+        seal = None if sealing is None else sealing.answer(key, payload, heard)
         self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES) + attachment_bytes(seal))
         with self._connection.sending():
             query.reply(key, payload, attachment=seal)

@@ -4,7 +4,7 @@ import contextlib
 import os
 import socket
 import stat
-from collections.abc import Container, Iterator
+from collections.abc import Collection, Container, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -44,12 +44,23 @@ def cut(links: Container[Ends]) -> int:
 def stop_listening(ports: Container[int]) -> int:
     """Takes the listening sockets of these ports out of service, so that others may listen there; how many."""
     found = 0
+    for end in _listening(ports):
+        with contextlib.suppress(OSError):
+            end.shutdown(socket.SHUT_RDWR)
+            found += 1
+    return found
+
+
+def is_listening(ports: Collection[int]) -> bool:
+    """Whether this process listens at all of these ports."""
+    return {end.getsockname()[1] for end in _listening(ports)} == set(ports)
+
+
+def _listening(ports: Container[int]) -> Iterator[socket.socket]:
     for end in _tcp_sockets():
         with end, contextlib.suppress(OSError):
             if end.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) and end.getsockname()[1] in ports:
-                found += 1
-                end.shutdown(socket.SHUT_RDWR)
-    return found
+                yield end
 
 
 def ends_of(end: socket.socket) -> Ends | None:

@@ -2,10 +2,12 @@
 
 Deficit round robin over the turns (a vehicle, a district) by their bytes, within two groups: turns that have been seen
 for a while, and newcomers. A name costs nothing to invent; so all newcomers together have a share of their own, however
-many they are, and only a name that comes again after `KNOWN_AFTER_S` leaves them.
+many they are, and only a name that comes again after `KNOWN_AFTER_S` leaves them. While known ones come, newcomers have
+a part of the threads only, so that a known one finds a thread that is free.
 """
 
 import logging
+import math
 import threading
 import time
 from collections import OrderedDict, deque
@@ -20,10 +22,16 @@ KNOWN_AFTER_S: Final = 30.0
 """A turn seen again after so long is known."""
 REMEMBERED_TURNS: Final = 65_536
 """Of each group; the oldest are forgotten."""
+LONGEST_TURN: Final = 128
+"""Characters of a turn that tell it from others: a key may have 65,535, and turns are remembered."""
 KNOWN_SHARE: Final = 3
 """So many times as much is served of the known as of newcomers, where both wait."""
 OF_ONE_TURN: Final = 4
 """One turn may fill a quarter of the mailbox."""
+NEWCOMERS_THREADS: Final = 4
+"""Newcomers have a quarter of the threads ..."""
+KNOWN_COME_S: Final = 60.0
+"""... while a known one has come within so long."""
 _QUANTUM_BYTES: Final = 64 * 1024
 _HEAD_BYTES: Final = 1024  # what any message costs, as bytes
 
@@ -108,10 +116,12 @@ class InTurn(Generic[_T]):
         limit: int,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._handle, self.limit = handle, limit
+        self._handle, self.limit, self._clock_s = handle, limit, clock_s
         self._known, self._new = _Group[_T](), _Group[_T]()
         self._turns = KnownTurns(clock_s)
-        self._count = 0
+        self._count = self._new_in_hand = 0
+        self._most_new = max(1, count // NEWCOMERS_THREADS)
+        self._known_s = -math.inf
         self._changed = threading.Condition()
         self._closed = False
         self._threads = [threading.Thread(target=self._run, name=f"{name}-{i}", daemon=True) for i in range(count)]
@@ -133,7 +143,10 @@ class InTurn(Generic[_T]):
         with self._changed:
             if self._closed:
                 return (item,)
-            group = self._known if self._turns.is_known(turn) else self._new
+            turn = turn[:LONGEST_TURN]
+            is_known = self._turns.is_known(turn)
+            self._known_s = self._clock_s() if is_known else self._known_s
+            group = self._known if is_known else self._new
             if len(group.waiting.get(turn, ())) >= max(1, self.limit // OF_ONE_TURN):
                 return (item,)
             group.put(turn, size_bytes + _HEAD_BYTES, item)
@@ -167,28 +180,43 @@ class InTurn(Generic[_T]):
                     _LOG.warning("%s is still busy %.0f s after it was told to end", thread.name, _JOIN_S)
 
     def _run(self) -> None:
-        while (item := self._next()) is not None:
+        while (taken := self._next()) is not None:
+            item, is_new = taken
             try:
-                self._handle(item[0])
+                self._handle(item)
             except Exception:
                 _LOG.exception("%s: handler failed", threading.current_thread().name)
-            del item  # a query is finalised when its last reference goes
+            del item, taken  # a query is finalised when its last reference goes
+            if is_new:
+                with self._changed:
+                    self._new_in_hand -= 1
+                    self._changed.notify()
 
-    def _next(self) -> tuple[_T] | None:
+    def _next(self) -> tuple[_T, bool] | None:
+        """The next item and whether it is a newcomer's; None: closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._count)
+            self._changed.wait_for(lambda: self._closed or self._known.waiting or self._may_take_new())
             if self._closed:
                 return None
             self._count -= 1
-            return (self._take(),)
+            item, is_new = self._take()
+            self._new_in_hand += is_new
+            return item, is_new
 
-    def _take(self) -> _T:
+    def _may_take_new(self) -> bool:
+        if not self._new.waiting:
+            return False
+        return self._new_in_hand < self._most_new or self._clock_s() - self._known_s > KNOWN_COME_S
+
+    def _take(self) -> tuple[_T, bool]:
         """Of the group that has had less of its share; one that was idle does not save up."""
         known, new = self._known, self._new
-        if not (known.waiting and new.waiting):
+        if not (known.waiting and self._may_take_new()):
             known.served = new.served = 0.0
-            return (known if known.waiting else new).take()[1]
-        group, share = (known, KNOWN_SHARE) if known.served <= new.served else (new, 1)
+            is_new = not known.waiting
+            return (new if is_new else known).take()[1], is_new
+        is_new = known.served > new.served
+        group, share = (new, 1) if is_new else (known, KNOWN_SHARE)
         cost, item = group.take()
         group.served += cost / share
-        return item
+        return item, is_new

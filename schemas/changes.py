@@ -5,7 +5,7 @@ when the map has moved on. Every voxel that the drive has observed is named: the
 change, too.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -85,6 +85,9 @@ class TileChange:
     """Standard deviation of the refined attitude, about its worst axis, over the same scans."""
     doubt: Doubt | None = None
     """Why the vehicle does not fully believe this; None = it does."""
+    unsure: Gaussians = field(default_factory=Gaussians.empty)
+    """Where the base holds nothing and the drive met something, but too little to decide: U voxels, none observed.
+    `count` and `cells` are the sub-cells that half as many points would have met, 1 to 19."""
 
     def __post_init__(self) -> None:
         with refusing(_AboutTile(self.tile)):
@@ -95,13 +98,27 @@ class TileChange:
             self._check_voxels()
             self._check_values()
             _check_covariances(self.changed)
+            if len(self.unsure):
+                self._check_unsure()
             self._check_withheld()
 
     def _check_withheld(self) -> None:
-        if self.doubt is not None and self.doubt.withheld and len(self.observed):
-            raise BadValue(
-                f"{self.doubt.withheld} changes are held back, and {len(self.observed)} voxels are named all the same"
-            )
+        named = len(self.observed) + len(self.unsure)
+        if self.doubt is not None and self.doubt.withheld and named:
+            raise BadValue(f"{self.doubt.withheld} changes are held back, and {named} voxels are named all the same")
+
+    def _check_unsure(self) -> None:
+        check_length("unsure", len(self.unsure), limits.MAX_UNSURE_OF_REPORT, "voxels")
+        ids, cells = self.unsure.voxel_id, self.unsure.cells
+        both = are_in(ids, self.observed)
+        if both.any():
+            raise BadValue(f"{both.sum()} voxels are unsure and observed, first {ids[both][0]}")
+        if cells.min() < 1 or cells.max() > limits.MAX_UNSURE_CELLS:
+            raise BadValue(f"unsure voxels of {cells.min()} .. {cells.max()} cells, not 1 .. {limits.MAX_UNSURE_CELLS}")
+        if (self.unsure.count != cells).any():
+            raise BadValue(f"{(self.unsure.count != cells).sum()} unsure voxels count points, not sub-cells")
+        _check_covariances(self.unsure)
+        _check_floors(self.tile, ids[[0, -1]])
 
     def _check_voxels(self) -> None:
         if not (self.observed[1:] > self.observed[:-1]).all():
@@ -135,6 +152,7 @@ class TileChange:
     def _same_arrays(self, other: "TileChange") -> bool:
         return (
             self.changed == other.changed
+            and self.unsure == other.unsure
             and np.array_equal(self.observed, other.observed)
             and np.array_equal(self.change_class, other.change_class)
             and np.array_equal(self.evidence, other.evidence)
@@ -192,6 +210,7 @@ class ChangeReport:
         check_text("layer", self.layer, LAYER_PATTERN)
         check_tiles_of_district(self.report_id, self.district, self.tiles)
         _check_observed(sum(len(change.observed) for change in self.tiles), len(self.tiles))
+        _check_unsure(sum(len(change.unsure) for change in self.tiles), len(self.tiles))
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeReport."""
@@ -251,17 +270,20 @@ def _change_message(change: TileChange) -> tile_change_pb2.TileChange:
         pose_sigma_m=change.pose_sigma_m,
         pose_sigma_rad=change.pose_sigma_rad,
         doubt=None if change.doubt is None else doubt_message(change.doubt),
+        unsure=encode_gaussians(change.unsure) if len(change.unsure) else b"",
     )
 
 
 def _change_values(message: change_report_pb2.ChangeReport) -> tuple[TileChange, ...]:
     """Tile by tile, so that a report made of many bitmaps that unpack to much is refused before it has unpacked all."""
     changes: list[TileChange] = []
-    observed = 0
+    observed = unsure = 0
     for change in message.tiles:
         changes.append(_change_value(change))
         observed += len(changes[-1].observed)
         _check_observed(observed, len(changes))
+        unsure += len(changes[-1].unsure)
+        _check_unsure(unsure, len(changes))
     return tuple(changes)
 
 
@@ -270,13 +292,20 @@ def _check_observed(voxels: int, tiles: int) -> None:
         raise TooLarge(f"report observes more than {limits.MAX_OBSERVED_OF_REPORT} voxels in {tiles} tiles")
 
 
+def _check_unsure(voxels: int, tiles: int) -> None:
+    if voxels > limits.MAX_UNSURE_OF_REPORT:
+        raise TooLarge(f"report is unsure of more than {limits.MAX_UNSURE_OF_REPORT} voxels in {tiles} tiles")
+
+
 def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
     tile = tile_id(message.tile)
     with refusing(_AboutTile(tile)):
         observed = decode_observed(message.observed_first, message.observed_bitmap)
-        changed = codec_of(message.codec_id).decode(tile, message.changed)
+        codec = codec_of(message.codec_id)
+        changed = codec.decode(tile, message.changed)
         evidence = _evidence_of(message, len(changed))
         doubt = doubt_value(message.doubt) if message.HasField("doubt") else None
+        unsure = codec.decode(tile, message.unsure) if message.unsure else Gaussians.empty()
     return TileChange(
         tile=tile,
         base_version=message.base_version,
@@ -288,6 +317,7 @@ def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
         pose_sigma_m=message.pose_sigma_m,
         pose_sigma_rad=message.pose_sigma_rad,
         doubt=doubt,
+        unsure=unsure,
     )
 
 

@@ -7,6 +7,7 @@ SchemaError
 ├── Malformed       bytes that are not the message they should be
 ├── BadValue        a field whose value cannot be
 ├── WrongHash       content that does not have the hash it claims
+├── NotSigned       a tile version that no publisher answers for, or an older one than was seen
 ├── LayerError      a declaration of a feature layer that cannot be, or is missing
 ├── DriveError      a recorded drive that cannot be read or written
 ├── NoPlace         a drive whose place on the Earth is not known, where one is needed
@@ -42,6 +43,10 @@ class BadValue(SchemaError):
 
 class WrongHash(SchemaError):
     """Content that does not have the hash it claims."""
+
+
+class NotSigned(SchemaError):
+    """A tile version that no publisher answers for, or an older one than was seen."""
 
 
 class LayerError(SchemaError):

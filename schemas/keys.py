@@ -106,7 +106,7 @@ KEY_TABLE: Final = (
     ),
     KeySpec(
         pattern=f"{ROOT}/authority/<list>",
-        kind="put, operator → routers, shards, tile servers",
+        kind="put, operator → routers; `revoked` → everybody",
         request="`members`: MemberList (JSON, signed); `revoked`: CRL (PEM)",
         reply="–",
         reliability="the list with the highest number counts; also in the identity folder of each router",

@@ -13,7 +13,7 @@ MAX_TILE_REQUEST_BYTES: Final = 1 * KIB
 MAX_TILE_BODY_BYTES: Final = 4 * MIB
 MAX_TILE_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
 MAX_TILES_REQUEST_BYTES: Final = 24 * KIB
-MAX_TILES_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + 64 * KIB
+MAX_TILES_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + 160 * KIB
 MAX_CATALOG_BYTES: Final = 128 * KIB
 MAX_CHANGE_REPORT_BYTES: Final = 8 * MIB
 MAX_PACKED_REPORT_BYTES: Final = 1 * MIB
@@ -28,6 +28,12 @@ MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
 
 # A district (q5/q10/q15) is 32 x 32 tiles.
 MAX_TILES_OF_DISTRICT: Final = 1024
+# A published archive: an index takes some 20 bytes a tile, and its district has few packs.
+MAX_ARCHIVE_INDEX_BYTES: Final = 128 * KIB
+MAX_PACK_BYTES: Final = 16 * MIB
+MAX_PACKS_OF_DISTRICT: Final = 256
+MAX_DISTRICTS_OF_ARCHIVE: Final = 250_000
+MAX_ARCHIVE_ROOT_BYTES: Final = 2 * MIB
 # Fields on the top level of a report: its tiles and its own, with room for a newer minor version's.
 MAX_REPORT_FIELDS: Final = MAX_TILES_OF_DISTRICT + 64
 # Fields on the top level of a reply about a district's tiles: five values a tile at most, with room.
@@ -44,6 +50,10 @@ MAX_OBSERVED_OF_REPORT: Final = 8 * MIB
 
 # Flags of a packed report: each becomes a statement that is kept and merged.
 MAX_FLAGS_OF_REPORT: Final = 256 * KIB
+# Voxels of a report upon which its vehicle does not decide, and the sub-cells that one of them may count: more would
+# have been a Gaussian.
+MAX_UNSURE_OF_REPORT: Final = 64 * KIB
+MAX_UNSURE_CELLS: Final = 19
 # A report ends at most so long after it is received: the clocks of vehicles differ. Old ones are welcome.
 MAX_AHEAD_NS: Final = 300_000_000_000
 # Way of a packed report's track: the cloud looks along all of it.
@@ -61,8 +71,8 @@ MAX_POINTS_OF_FEATURE: Final = 4_096
 MAX_DETECTIONS_OF_LOOK: Final = 1_024
 MAX_SECTORS_OF_LOOK: Final = 4_096
 # What a feature report holds over all its tiles: judged and found features, points of those found.
-MAX_FEATURES_OF_REPORT: Final = 16_384
-MAX_POINTS_OF_REPORT: Final = 65_536
+MAX_FEATURES_OF_REPORT: Final = 4_096
+MAX_POINTS_OF_REPORT: Final = 32_768
 # A feature lies in its tile, but for rounding and the error of who measured it.
 MAX_FOUND_OUTSIDE_M: Final = 1.0
 MAX_SEEN_OUTSIDE_M: Final = 100.0

@@ -77,9 +77,18 @@ class PackedReport:
     """(index in the district, doubt) of the tiles that are doubtful, ascending; nothing of them is held back."""
     course: Course | None = None
     """Where the vehicle drives in its own frame; None = it does not know."""
+    unsure: bytes = b""
+    """Of `gnd.gnd_map.codec.encode_flags`: voxels upon which the vehicle does not decide, all as new; empty: none."""
+    unsure_measured: bytes = b""
+    """Of `gnd.gnd_map.codec.encode_measured`: what it met there."""
 
     def __post_init__(self) -> None:
         check_report_head(self)
+        if bool(self.unsure) != bool(self.unsure_measured):
+            raise BadValue(
+                f"packed report {self.report_id}: {len(self.unsure)} bytes of unsure voxels and "
+                f"{len(self.unsure_measured)} of what was met there: one goes with the other"
+            )
         check_unsigned("pose_sigma_tenth_mm", self.pose_sigma_tenth_mm, bits=_SIGMA_BITS)
         check_unsigned("pose_sigma_10urad", self.pose_sigma_10urad, bits=_SIGMA_BITS)
         if len(self.base_digest) != DIGEST_BYTES:
@@ -146,6 +155,8 @@ class PackedReport:
             doubtful=[index for index, _ in self.doubts],
             doubts=[doubt_message(doubt) for _, doubt in self.doubts],
             course=course_message(self.course),
+            unsure=self.unsure,
+            unsure_measured=self.unsure_measured,
         )
         message = change_report_pb2.ChangeReport(major=MAJOR, packed=packed)
         return serialise(message, limits.MAX_PACKED_REPORT_BYTES)
@@ -248,6 +259,8 @@ def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
         pose_sigma_10urad=message.pose_sigma_10urad,
         doubts=tuple(zip(message.doubtful, map(doubt_value, message.doubts), strict=True)),
         course=course_value(message.course) if message.HasField("course") else None,
+        unsure=message.unsure,
+        unsure_measured=message.unsure_measured,
     )
 
 

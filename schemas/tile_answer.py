@@ -10,6 +10,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import limits
 from gnd.schemas.errors import BadValue, WrongHash
 from gnd.schemas.tiles import as_kind, check_day, check_hash, tile_from_delta
+from gnd.schemas.version_signature import VersionSignature
 from gnd.schemas.wire import check_length, check_version, check_word, refusing
 
 ANSWER_HASH_BYTES: Final = 4
@@ -46,6 +47,8 @@ class TileAnswer:
     """Of a blob in its codec, or of a delta by `gnd.gnd_map.content.encode_content_delta`; else empty."""
     day: int = UNKNOWN_DAY
     """When the world looked as a blob or delta says (`gnd.gnd_map.day`); else not known."""
+    signature: VersionSignature | None = None
+    """Of who answers for a blob's or delta's version; None: nobody does."""
 
     def __post_init__(self) -> None:
         check_word(self.status, ANSWER_STATUS, "answer status")
@@ -56,7 +59,8 @@ class TileAnswer:
             check_version("codec id", self.codec_id, lowest=0)
             good = len(self.sha) == ANSWER_HASH_BYTES and (self.status == "blob" or self.codec_id == 0)
         else:
-            good = (self.version, self.sha, self.codec_id, self.body, self.day) == (0, b"", 0, b"", UNKNOWN_DAY)
+            told = (self.version, self.sha, self.codec_id, self.body, self.day, self.signature)
+            good = told == (0, b"", 0, b"", UNKNOWN_DAY, None)
         if not good:
             raise BadValue(
                 f"answer {self.status!r} with version {self.version}, a hash of {len(self.sha)} bytes, codec"

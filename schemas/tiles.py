@@ -21,6 +21,7 @@ from gnd.schemas.generated import (
     tile_reply_pb2,
     tile_request_pb2,
 )
+from gnd.schemas.version_signature import VersionSignature, decode_signatures, signatures_message
 from gnd.schemas.wire import (
     MAJOR,
     check_length,
@@ -250,12 +251,16 @@ class TileReply:
     """Set exactly when the status is "blob"."""
     delta: CodedDelta | None = None
     """Set exactly when the status is "delta"."""
+    signature: VersionSignature | None = None
+    """Of who answers for the version in the blob or delta; None: nobody does."""
 
     def __post_init__(self) -> None:
         check_word(self.status, _STATUS, "TileReply status")
         for name, part in (("blob", self.blob), ("delta", self.delta)):
             if (self.status == name) != (part is not None):
                 raise BadValue(f"TileReply {self.status!r} {'without' if part is None else 'with'} a {name}")
+        if self.signature is not None and self.blob is None and self.delta is None:
+            raise BadValue(f"TileReply {self.status!r} with a signature")
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.TileReply."""
@@ -263,6 +268,7 @@ class TileReply:
             major=MAJOR,
             blob=_blob_message(self.blob) if self.blob else None,
             delta=_delta_message(self.delta) if self.delta else None,
+            signatures=signatures_message([self.signature]),
         )
         message.status = tile_reply_pb2.TileReply.Status.ValueType(number_of(self.status, _STATUS))
         return serialise(message, limits.MAX_TILE_REPLY_BYTES)
@@ -277,6 +283,7 @@ class TileReply:
             status,
             _blob_value(message.blob) if message.HasField("blob") else None,
             _delta_value(message.delta) if message.HasField("delta") else None,
+            decode_signatures(message.signatures, 1)[0] if message.HasField("signatures") else None,
         )
 
 

@@ -23,6 +23,7 @@ from gnd.schemas.tile_answer import (
     tile_of_answer,
 )
 from gnd.schemas.tiles import check_codecs
+from gnd.schemas.version_signature import VersionSignature, decode_signatures, signatures_message
 from gnd.schemas.wire import (
     MAJOR,
     check_length,
@@ -258,6 +259,7 @@ class TilesReply:
             bodies=(answer.body for answer in brought),
             days=_days([answer.day for answer in brought]),
             watched=self.watched,
+            signatures=signatures_message([answer.signature for answer in brought]),
         )
         return serialise(message, limits.MAX_TILES_REPLY_BYTES)
 
@@ -303,6 +305,10 @@ def _statuses(runs: Sequence[int]) -> list[AnswerStatus]:
     return [status for run in runs for status in [word_of(run % 8, ANSWER_STATUS, "answer status")] * (run // 8)]
 
 
+def _signatures(message: tiles_reply_pb2.TilesReply, count: int) -> Sequence[VersionSignature | None]:
+    return decode_signatures(message.signatures, count) if message.HasField("signatures") else [None] * count
+
+
 def _answers(message: tiles_reply_pb2.TilesReply) -> Iterator[TileAnswer]:
     statuses = _statuses(message.runs)
     n_brought, n_blobs = sum(s in WITH_BODY for s in statuses), statuses.count("blob")
@@ -314,11 +320,12 @@ def _answers(message: tiles_reply_pb2.TilesReply) -> Iterator[TileAnswer]:
             f" {counts[1]} hashes, {counts[2]} bodies and {counts[3]} codecs"
         )
     days = _days_of(message.days, n_brought)
-    brought = iter(zip(message.versions, hashes, message.bodies, days, strict=True))
+    signed = _signatures(message, n_brought)
+    brought = iter(zip(message.versions, hashes, message.bodies, days, signed, strict=True))
     codecs = iter(message.codecs)
     for status in statuses:
         if status in WITH_BODY:
-            version, sha, body, day = next(brought)
-            yield TileAnswer(status, version, sha, next(codecs) if status == "blob" else 0, body, day)
+            version, sha, body, day, signature = next(brought)
+            yield TileAnswer(status, version, sha, next(codecs) if status == "blob" else 0, body, day, signature)
         else:
             yield TileAnswer(status)

@@ -15,6 +15,7 @@ from gnd.schemas import limits
 from gnd.schemas.errors import BadValue, WrongHash
 from gnd.schemas.generated import tile_delta_pb2, tile_update_pb2
 from gnd.schemas.tiles import check_day, check_hash, tile_from_delta
+from gnd.schemas.version_signature import check_seconds
 from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
@@ -64,6 +65,8 @@ class TileUpdate:
     """Voxels or features that come or are replaced, where the notice has no delta to tell."""
     removed_count: int = 0
     """Voxels or features that go, where the notice has no delta to tell."""
+    made_s: int = 0
+    """When the new version was made, POSIX seconds; 0 = not told (versions are not signed)."""
 
     def __post_init__(self) -> None:
         check_text("layer", self.layer, LAYER_PATTERN)
@@ -76,6 +79,7 @@ class TileUpdate:
         self._check_coded()
         self._check_counts()
         check_day(self.day)
+        check_seconds(self.made_s)
         if self.previous_version >= self.version:
             raise BadValue(f"update of tile {self.tile} to version {self.version} from {self.previous_version}")
 
@@ -134,6 +138,7 @@ class TileUpdate:
             day=self.day,
             put_count=self.put_count,
             removed_count=self.removed_count,
+            made_s=self.made_s,
         )
         message.reason = tile_update_pb2.TileUpdate.Reason.ValueType(number_of(self.reason, _REASON))
         return serialise(message, limits.MAX_TILE_UPDATE_BYTES)
@@ -161,6 +166,7 @@ class TileUpdate:
             day=message.day,
             put_count=message.put_count,
             removed_count=message.removed_count,
+            made_s=message.made_s,
         )
 
 

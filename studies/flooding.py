@@ -13,6 +13,7 @@ from typing import Final
 from gnd.deploy.chaos.street import ChaosStreet, read_street
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.sealing import Sealing
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import alive_key, batch_key, catalog_keys, state_key, tiles_key
 from gnd.schemas.report_id import deterministic_report_id
@@ -25,13 +26,13 @@ PATIENCE_MS: Final = 2_000
 Message = tuple[str, bytes]
 
 
-def reports(street: ChaosStreet, *, name_each: bool, salt: str) -> Iterator[Message]:
+def reports(street: ChaosStreet, *, name_each: bool, salt: str, name: str = FLOODER) -> Iterator[Message]:
     """Real reports without end, each under an id of its own; of one vehicle, or each of another."""
-    kept = [street.said(1, FLOODER, n) for n in range(4)]
+    kept = [street.said(1, name, n) for n in range(4)]
     for n in itertools.count():
         one = kept[n % len(kept)]
         report_id = deterministic_report_id(T0_MS + n, salt, str(n))
-        vehicle = f"{salt}-{n}" if name_each else FLOODER
+        vehicle = f"{salt}-{n}" if name_each else name
         yield one.key, replace(one.packed, report_id=report_id, vehicle=vehicle).encode()
 
 
@@ -56,8 +57,8 @@ def _all_tiles() -> bytes:
     return TilesRequest(wanted=tuple((index, 0) for index in range(1024))).encode()
 
 
-def messages(kind: str, tile: TileId) -> Iterator[Message]:
-    """Those of a kind."""
+def messages(kind: str, tile: TileId, name: str = FLOODER) -> Iterator[Message]:
+    """Those of a kind; `name`: of the vehicle, where each is not of another."""
     if kind in ("tiles", "regions", "catalogs", "states"):
         return questions(kind, tile)
     street, salt = read_street(), f"{os.getpid()}"
@@ -67,7 +68,7 @@ def messages(kind: str, tile: TileId) -> Iterator[Message]:
         return nonsense(street, 8_000_000)
     if kind == "oversize":
         return ((key, bytes(12_000_000)) for key, _ in nonsense(street, 1))
-    return reports(street, name_each=kind == "names", salt=salt)
+    return reports(street, name_each=kind == "names", salt=salt, name=name)
 
 
 def flood(kind: str, connect: str, hz: float, tile: int, gate: str = "", *, stop: threading.Event) -> None:
@@ -75,8 +76,9 @@ def flood(kind: str, connect: str, hz: float, tile: int, gate: str = "", *, stop
     always).
     """
     with open_bus(BusConfig(connect=(connect,)), name=FLOODER) as bus:
-        session = bus.connection.session
-        source, due_s = messages(kind, TileId(tile)), time.monotonic()
+        session, sealing = bus.connection.session, bus.connection.sealing
+        name = FLOODER if sealing is None else sealing.own.name
+        source, due_s = messages(kind, TileId(tile), name), time.monotonic()
         while not stop.is_set():
             if gate and not Path(gate).exists():
                 time.sleep(0.05)
@@ -87,10 +89,16 @@ def flood(kind: str, connect: str, hz: float, tile: int, gate: str = "", *, stop
                 key,
                 lambda _reply: None,
                 payload=payload,
+                attachment=None if sealing is None else _seal(sealing, key, payload),
                 timeout=PATIENCE_MS / 1000,
             )
             due_s = max(due_s + 1.0 / hz, time.monotonic() - 1.0)
             time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def _seal(sealing: Sealing, key: str, payload: bytes) -> bytes:
+    """With the certificate each time: who does not hear answers does not know whether it is wanted."""
+    return sealing.question(key, payload, count_wanted=False, with_chain=True).attachment
 
 
 def ghosts(connect: str, names: tuple[str, ...], *, stop: threading.Event) -> None:

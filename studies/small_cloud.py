@@ -6,7 +6,7 @@ What its tiles and reports hold no vehicle has measured: here it does not matter
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +46,7 @@ class SmallCloud:
         store: open here too, to publish by.
         base: the tiles as they were first.
         folder: of logs and whatever clients write.
+        identities: folder of the processes' identities; None: the bus is plain.
         put_s: when each (tile, version) was committed here, by the monotonic clock, s.
     """
 
@@ -54,11 +55,16 @@ class SmallCloud:
     store: SqliteStore
     base: Sequence[Tile]
     folder: Path
+    identities: Path | None = None
     put_s: dict[tuple[int, int], float] = field(default_factory=dict)
 
     def pid(self, name: str) -> int:
         """The process that bears this name now."""
         return self.supervisor.pids()[name]
+
+    def identity_of(self, name: str) -> Path | None:
+        """The identity folder of a process or vehicle; None where the bus is plain."""
+        return None if self.identities is None else self.identities / name
 
     def publish(self, number: int) -> None:
         """Commit another version of one of the tiles: half of its voxels have another mean."""
@@ -68,10 +74,16 @@ class SmallCloud:
 
 
 @contextmanager
-def small_cloud(folder: Path, shards: int = 1) -> Iterator[SmallCloud]:
-    """Start a cloud, wait until it answers, end it with the block."""
+def small_cloud(folder: Path, shards: int = 1, identities: Path | None = None) -> Iterator[SmallCloud]:
+    """Start a cloud, wait until it answers, end it with the block.
+
+    Args:
+        folder: of store and logs.
+        shards: merger shards.
+        identities: of `make_identities`, for a bus with certificates, rights and seals; None: a plain one.
+    """
     start_fork_server()
-    connect = f"tcp/127.0.0.1:{claim_port(0)}"
+    connect = f"{'tcp' if identities is None else 'tls'}/127.0.0.1:{claim_port(0)}"
     base = tiles()
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -79,12 +91,14 @@ def small_cloud(folder: Path, shards: int = 1) -> Iterator[SmallCloud]:
         store.put_tiles(base)
         supervisor = Supervisor(folder, folder / "pids.json")
         stack.callback(supervisor.stop)
+        cloud = SmallCloud(connect, supervisor, store, base, folder, identities)
         for spec in _processes(connect, folder, shards):
-            supervisor.start(spec)
+            supervisor.start(replace(spec, identity=cloud.identity_of(spec.name)))
         stack.enter_context(_supervised(supervisor))
-        with open_bus(BusConfig(connect=(connect,), open_timeout_s=READY_S), name="probe") as bus:
+        own = BusConfig(connect=(connect,), open_timeout_s=READY_S, identity=cloud.identity_of("fleet"))
+        with open_bus(own, name="probe") as bus:
             bus.request(tile_key("ndt", base[0].tile_id), b"", kind="tile", timeout_s=READY_S)
-        yield SmallCloud(connect, supervisor, store, base, folder)
+        yield cloud
 
 
 def tiles() -> list[Tile]:

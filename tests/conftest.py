@@ -1,5 +1,6 @@
-"""Fixtures that every test may use, and how the suite is dealt out to processes (`pytest -n 2 --dist loadscope`)."""
+"""Fixtures that every test may use, and how the suite is dealt out to processes (`pytest -n 3 --dist loadscope`)."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -8,19 +9,30 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from postgres_fixtures import new_database, postgres
 from suite_groups import (
     pytest_collection_modifyitems,
     pytest_configure_node,
     pytest_xdist_make_scheduler,
 )
 from suite_ports import new_port
+from web_fixtures import new_bucket, s3_server, served
 
-# Hooks that pytest finds here.
-__all__ = ["pytest_collection_modifyitems", "pytest_configure_node", "pytest_xdist_make_scheduler"]
+# Hooks and fixtures that pytest finds here.
+__all__ = [
+    "new_bucket",
+    "new_database",
+    "postgres",
+    "pytest_collection_modifyitems",
+    "pytest_configure_node",
+    "pytest_xdist_make_scheduler",
+    "s3_server",
+    "served",
+]
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
-WARM_UP = "from gnd.vehicle_agent import warm as v; from gnd.cloud_merger import warm as c; v.warm_up(); c.warm_up()"
+WARM_UP = Path(__file__).with_name("suite_kernels.py")
 
 
 def pytest_configure() -> None:
@@ -29,19 +41,24 @@ def pytest_configure() -> None:
     A process hands an ignored signal on to all that it starts, and Python then makes no KeyboardInterrupt of it: what
     tests of Ctrl-C start would not hear them, and outlive them. That the commands themselves keep to what they were
     started with is the custom of the system, and stays.
+
+    While tests are collected nothing becomes garbage: to look for it takes a third of that time.
     """
+    gc.disable()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_collection_finish() -> None:
+    """Collect garbage from now on, but look no more at the thousands of tests and modules that stay."""
+    gc.freeze()
+    gc.enable()
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes() -> None:
-    """Compile the kernels of vehicle and cloud before the processes start: on a new machine each would compile them.
-
-    And numba takes no lock on its index of a kernel: of two signatures written at the same moment it may mix up the
-    files.
-    """
-    subprocess.run([sys.executable, "-c", WARM_UP], check=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+    """Compile the kernels of vehicle, cloud and simulator before the processes start: see `suite_kernels`."""
+    subprocess.run([sys.executable, str(WARM_UP)], check=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
 
 
 @pytest.fixture(autouse=True)

@@ -17,6 +17,7 @@ from gnd.schemas.keys import batch_key
 from gnd.schemas.tile_answer import content_of_answer
 from gnd.schemas.tiles import TileBlob
 from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
+from gnd.tile_client.checking import VersionCheck
 
 Head = tuple[int, bytes]
 """Version and sha of a tile that is held."""
@@ -87,7 +88,7 @@ class ExchangeOutcome(Generic[TileT]):
     later: list[TileId] = field(default_factory=list)
     """Did not fit into the answer: ask again."""
     wrong: dict[TileId, str] = field(default_factory=dict)
-    """The content was not what its hash says: ask for the whole tile."""
+    """The content was not what its hash says, or nobody answers for it: ask for the whole tile."""
     body_bytes: dict[TileId, int] = field(default_factory=dict)
     """Size of each tile that came whole."""
     watched: set[TileId] = field(default_factory=set)
@@ -104,6 +105,7 @@ class Exchange(Generic[TileT]):
         attempt_s: how long one attempt may take.
         ticket: of a vehicle, see `TilesRequest`.
         newest: ask for the newest versions, released or not.
+        check: of the versions that come; None: they are taken as they are.
     """
 
     def __init__(
@@ -115,7 +117,9 @@ class Exchange(Generic[TileT]):
         *,
         ticket: int = 0,
         newest: bool = False,
+        check: VersionCheck | None = None,
     ) -> None:
+        self._check = check
         self._ticket, self._wants_newest = ticket, newest
         self._bus, self._holder, self._timeout_s = bus, holder, timeout_s
         self._retry = RetryPolicy(attempt_timeout_s=attempt_s)
@@ -214,7 +218,7 @@ class Exchange(Generic[TileT]):
         return Fetched(tile_id, "unchanged", self._from_holder(tile_id))
 
     def _blob(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched[TileT]:
-        tile = content_of_answer(tile_id, answer, self._kind)
+        tile = self._checked(content_of_answer(tile_id, answer, self._kind), answer)
         blob = TileBlob(tile_id, answer.version, tile.sha, answer.codec_id, answer.body, answer.day)
         return Fetched(tile_id, "blob", self._newest(tile, held[1], blob))
 
@@ -222,8 +226,14 @@ class Exchange(Generic[TileT]):
         cached = self._from_holder(tile_id)
         if cached.sha != held[1] and (cached.version >= answer.version or cached.sha.startswith(answer.sha)):
             return Fetched(tile_id, "unchanged", cached)  # a notice brought it while the answer was on its way
-        tile = content_of_answer(tile_id, answer, self._kind, cached)
+        tile = self._checked(content_of_answer(tile_id, answer, self._kind, cached), answer)
         return Fetched(tile_id, "delta", self._newest(tile, held[1]))
+
+    def _checked(self, tile: TileT, answer: TileAnswer) -> TileT:
+        """The tile itself, if it is one to use; raises NotSigned."""
+        if self._check is not None:
+            self._check.check(tile, answer.signature)
+        return tile
 
     def _newest(self, tile: TileT, over: bytes, blob: TileBlob | None = None) -> TileT:
         """Keep the tile; gives the one that is held instead where that is newer. A full disk stops no drive."""

@@ -1,7 +1,7 @@
 """Tiles of any region from the tile server, in batches of one district."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Final
 
@@ -12,6 +12,7 @@ from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import batch_key, catalog_keys
 from gnd.schemas.tiles import Catalog, CatalogEntry
+from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.exchange import Exchange, ExchangeOutcome, TilesInMemory
 
 BATCH_BYTES: Final = 1_000_000
@@ -28,12 +29,17 @@ class TileServerClient:
         layer: name of the layer.
         timeout_s: how long one question is asked again before it fails.
         newest: fetch the newest versions, also those that are on trial with a share of the vehicles.
+        check: of the versions that come: by the identity of the bus; None where it has none.
     """
 
     bus: Bus
     layer: str
     timeout_s: float
     newest: bool = False
+    check: VersionCheck | None = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "check", VersionCheck.on_the_bus(self.bus, self.layer))
 
     def catalog(self, region: Region) -> list[CatalogEntry]:
         """The newest version of each tile of the region, by tile.
@@ -54,11 +60,11 @@ class TileServerClient:
             held: what the caller holds of them: only what differs is sent.
 
         Raises:
-            RequestFailed: no answer, or one that is wrong twice.
+            RequestFailed: no answer, or one that is wrong twice: no content of its hash, or nobody answers for it.
             SchemaError: an answer that is none.
         """
         exchange: Exchange[AnyTile] = Exchange(
-            self.bus, TilesInMemory(self.layer, held), self.timeout_s, newest=self.newest
+            self.bus, TilesInMemory(self.layer, held), self.timeout_s, newest=self.newest, check=self.check
         )
         for _, group in groupby(sorted(tiles), key=lambda tile: tile.district):
             wanted, whole = list(group), {tile for tile in tiles if tile not in held}

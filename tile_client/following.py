@@ -20,7 +20,8 @@ class NewVersion:
         layer: name of the layer.
         tile: which tile.
         version: its number.
-        notice: the notice; None where it was lost and the catalog names the version.
+        notice: the notice; None where it was lost and the catalog names the version: on the word of a tile server
+            alone, until the tile is fetched.
     """
 
     layer: str
@@ -53,6 +54,7 @@ class RegionFollower:
         history: bool = False,
     ) -> None:
         self.known: dict[tuple[str, TileId], int] = {}
+        self._told: dict[tuple[str, TileId], int] = {}
         self._asking, self._region, self._compared_every_s = asking, region, compared_every_s
         self._notices = Notices(bus, history=history)
         self._notices.follow([update_keys(layer, region.prefix) for layer in asking])
@@ -67,7 +69,9 @@ class RegionFollower:
         catalogs = {layer: asking.catalog(self._region) for layer, asking in self._asking.items()}
         for layer, entries in catalogs.items():
             for entry in entries:
-                self.known.setdefault((layer, entry.tile), entry.version)
+                self._told[layer, entry.tile] = entry.version
+                if self._asking[layer].check is None:  # else a number too high would hide the versions to come
+                    self.known.setdefault((layer, entry.tile), entry.version)
         self._compared_s = time.monotonic()
         return catalogs
 
@@ -88,12 +92,19 @@ class RegionFollower:
 
     def _missed(self) -> list[NewVersion]:
         self._compared_s = time.monotonic()
-        return [
-            NewVersion(layer, entry.tile, entry.version, None)
-            for layer, asking in self._asking.items()
-            for entry in asking.catalog(self._region)
-            if entry.version > self.known.get((layer, entry.tile), 0)
-        ]
+        found = []
+        for layer, asking in self._asking.items():
+            for entry in asking.catalog(self._region):
+                place = layer, entry.tile
+                told, self._told[place] = self._told.get(place, 0), entry.version
+                is_news = asking.check is None or entry.version != told
+                if is_news and entry.version > self.known.get(place, 0):
+                    found.append(NewVersion(layer, entry.tile, entry.version, None))
+        return found
+
+    def look_again(self, found: NewVersion) -> None:
+        """What the catalog names could not be fetched: the next comparison gives it again."""
+        self._told.pop((found.layer, found.tile), None)
 
     def close(self) -> None:
         """Listen to nothing any more."""

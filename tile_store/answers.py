@@ -64,9 +64,10 @@ class TileAnswers:
         held = self._by_sha(stored, wanted.cached_sha) if wanted.deltas else None
         sent = self._sent(stored, held, wanted.codecs)
         if sent.status == "delta":
-            return TileReply("delta", delta=CodedDelta(stored.tile, stored.version, stored.sha, sent.body, stored.day))
+            delta = CodedDelta(stored.tile, stored.version, stored.sha, sent.body, stored.day)
+            return TileReply("delta", delta=delta, signature=stored.signature)
         blob = TileBlob(stored.tile, stored.version, stored.sha, sent.codec_id, sent.body, stored.day)
-        return TileReply("blob", blob)
+        return TileReply("blob", blob, signature=stored.signature)
 
     def many(self, layer: str, district: District, request: TilesRequest) -> TilesReply:
         """The answers about tiles of a district, those around `request.near` first while bytes are left.
@@ -114,7 +115,8 @@ class TileAnswers:
         sent = self._sent(stored, self._by_sha(stored, held), codecs)
         codec_id = sent.codec_id if sent.status == "blob" else 0
         day = UNKNOWN_DAY if stored.codec_id in FEATURE_CODECS else stored.day
-        return TileAnswer(sent.status, stored.version, stored.sha[:ANSWER_HASH_BYTES], codec_id, sent.body, day)
+        sha = stored.sha[:ANSWER_HASH_BYTES]
+        return TileAnswer(sent.status, stored.version, sha, codec_id, sent.body, day, stored.signature)
 
     # What the client holds
 
@@ -280,7 +282,7 @@ def _nearest_first(tiles: Sequence[TileId], district: District, near: int | None
 
 def _within(left: int, limit: int, answer: TileAnswer) -> tuple[int, TileAnswer]:
     """Bytes left after an answer, and the answer: "later" where its body does not fit; the first one always does."""
-    size = len(answer.body)
+    size = len(answer.body)  # what signs it is small, and comes on top
     if size <= left or (size and left == limit):
         return left - size, answer
     return 0, TileAnswer("later")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,9 +11,11 @@ import apsw
 from gnd.gnd_map.content import decode_content
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.bodies import Bodies, bodies_at, place_of_bodies
+from gnd.tile_store.connection import SqlConnection, fetch
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.migrations import schema_of
-from gnd.tile_store.sqlite_connection import as_store_error, fetch, open_reader
+from gnd.tile_store.migrations import SCHEMA_VERSION, schema_of
+from gnd.tile_store.sqlite_connection import SqliteConnection, as_store_error, open_reader
 
 MOST_PAGES_NAMED: Final = 100
 
@@ -64,22 +67,30 @@ def check_store(path: Path, *, all_versions: bool = False, progress: Progress = 
         schema = schema_of(connection, path)
         damages = _of_file(connection, path)
         progress("pages", 1, 1)
-        statement = "keys_of_versions" if all_versions else "keys_of_heads"
-        keys, failed = _keys(connection, path, statement)
-        damages += failed
-        for done, (layer, tile, version, sha) in enumerate(keys, 1):
-            damages += _of_tile(connection, path, (layer, tile, version), sha)
-            progress("tiles", done, len(keys))
-        reports, failed = _keys(connection, path, "keys_of_reports")
-        damages += failed
-        for done, row in enumerate(reports, 1):
-            damages += _of_report(connection, path, row)
-            progress("reports", done, len(reports))
-        return Checked(schema, len(keys), len(reports), tuple(damages))
+        found = check_rows(connection, path, all_versions=all_versions, progress=progress)
+        return Checked(schema, found.tiles, found.reports, (*damages, *found.damages))
     except apsw.Error as error:
         raise as_store_error(error, path) from None
     finally:
         connection.close()
+
+
+def check_rows(
+    connection: SqlConnection, location: Path | str, *, all_versions: bool = False, progress: Progress = silent
+) -> Checked:
+    """As `check_store`, but only what a connection can read: no pages of a file."""
+    path, damages = Path(location), list[Damage]()
+    keys, failed = _keys(connection, path, "keys_of_versions" if all_versions else "keys_of_heads")
+    damages += failed
+    for done, (layer, tile, version, sha) in enumerate(keys, 1):
+        damages += _of_tile(connection, path, (layer, tile, version), sha)
+        progress("tiles", done, len(keys))
+    reports, failed = _keys(connection, path, "keys_of_reports")
+    damages += failed
+    for done, row in enumerate(reports, 1):
+        damages += _of_report(connection, path, row)
+        progress("reports", done, len(reports))
+    return Checked(SCHEMA_VERSION, len(keys), len(reports), tuple(damages))
 
 
 def require_whole(path: Path, progress: Progress = silent) -> Checked:
@@ -91,7 +102,7 @@ def require_whole(path: Path, progress: Progress = silent) -> Checked:
     return checked
 
 
-def _of_file(connection: apsw.Connection, path: Path) -> list[Damage]:
+def _of_file(connection: SqliteConnection, path: Path) -> list[Damage]:
     try:
         lines = [line for (line,) in connection.execute(f"PRAGMA integrity_check({MOST_PAGES_NAMED})")]
     except apsw.Error as error:
@@ -99,14 +110,14 @@ def _of_file(connection: apsw.Connection, path: Path) -> list[Damage]:
     return [Damage("file", path.name, line.replace("\n", " ")) for line in lines if line != "ok"]
 
 
-def _keys(connection: apsw.Connection, path: Path, statement: str) -> tuple[list[Any], list[Damage]]:
+def _keys(connection: SqlConnection, path: Path, statement: str) -> tuple[list[Any], list[Damage]]:
     try:
         return fetch(connection, statement), []
     except apsw.Error as error:  # the list itself is damaged
         return [], [Damage("file", path.name, f"{statement.replace('_', ' ')}: {error}")]
 
 
-def _of_tile(connection: apsw.Connection, path: Path, key: tuple[str, int, int], sha: bytes) -> Iterable[Damage]:
+def _of_tile(connection: SqlConnection, path: Path, key: tuple[str, int, int], sha: bytes) -> Iterable[Damage]:
     layer, tile, version = key
     name = f"{layer} {TileId(tile).path} version {version}"
     try:
@@ -114,6 +125,8 @@ def _of_tile(connection: apsw.Connection, path: Path, key: tuple[str, int, int],
         if not rows:
             return [Damage("tile", name, "the version is missing")]
         ((kept_sha, codec_id, body),) = rows
+        if not body:
+            body = _bodies_of(connection, path).read(kept_sha, codec_id)
         if decode_content(TileId(tile), version, codec_id, body).sha != kept_sha:
             return [Damage("tile", name, "its content is not what its hash says")]
         return [] if kept_sha == sha else [Damage("tile", name, "its hash is not the one in the index")]
@@ -121,7 +134,20 @@ def _of_tile(connection: apsw.Connection, path: Path, key: tuple[str, int, int],
         return [Damage("tile", name, str(as_store_error(error, path)))]
 
 
-def _of_report(connection: apsw.Connection, path: Path, row: tuple[str, int, str, int]) -> Iterable[Damage]:
+def _bodies_of(connection: SqlConnection, path: Path) -> Bodies:
+    """The objects among which bodies lie that are not in the store."""
+    place = place_of_bodies(connection)
+    if place is None:
+        raise StoreError(f"{path}: its body lies among objects, and the store does not say where")
+    return _reading(place)
+
+
+@lru_cache(maxsize=4)
+def _reading(place: str) -> Bodies:
+    return bodies_at(place, to_write=False)
+
+
+def _of_report(connection: SqlConnection, path: Path, row: tuple[str, int, str, int]) -> Iterable[Damage]:
     layer, tile, report_id, arrival = row
     name = f"{report_id} on {layer} {TileId(tile).path}"
     try:

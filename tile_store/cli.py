@@ -27,12 +27,16 @@ from gnd.gnd_map.settings import check_settings, setting, settings_text
 from gnd.schemas.feature_layer import LayerParameters, checked_layers
 from gnd.tile_store import tables, upkeep_cli
 from gnd.tile_store.arguments import parse_tile
+from gnd.tile_store.bodies_cli import bodies
 from gnd.tile_store.compare import layer_info, layer_totals
+from gnd.tile_store.copy_cli import copy
 from gnd.tile_store.errors import StoreError
+from gnd.tile_store.location import LOCATION, StoreLocation, file_of, open_store, shown
 from gnd.tile_store.metrics import StoreCollector, store_checks
 from gnd.tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
 from gnd.tile_store.server import TileServer
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.signing import Signing
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.status import status
 from gnd.tile_store.survey_cli import survey
 
@@ -43,7 +47,7 @@ __all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", 
 class TileServerConfig:
     """The tile server."""
 
-    path: Path = setting(..., "The store; `gnd map build` makes one.")
+    path: str | Path = setting(..., "The store, a file or a PostgreSQL URL; `gnd map build` makes one.")
     connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers, tried in order.")
     workers: int = setting(4, "Threads that answer.", least=1, most=64)
 
@@ -58,15 +62,17 @@ class TileServerConfig:
         checked_layers(self.feature_layer)
 
 
-@click.command()
-@click.option("--path", type=PATH, help="The store; `gnd map build` makes one.")
+@click.group(invoke_without_command=True)
+@click.option("--path", type=LOCATION, help="The store, a file or a PostgreSQL URL; `gnd map build` makes one.")
 @click.option("--connect", multiple=True, help=f"Endpoint of a router; repeatable.  [default: {DEFAULT_ENDPOINT}]")
 @click.option("--workers", type=int, help="Threads that answer, 1 to 64.  [default: 4]")
 @settings_options
 @metrics_options
 @identity_option
+@click.pass_context
 def store(
-    path: Path | None,
+    context: click.Context,
+    path: StoreLocation | None,
     connect: tuple[str, ...],
     workers: int | None,
     config_file: Path | None,
@@ -76,6 +82,8 @@ def store(
     metrics_host: str,
 ) -> None:
     """Run the tile server until Ctrl-C: it answers the vehicles' tile and catalog queries."""
+    if context.invoked_subcommand is not None:
+        return
     options = {"path": None if path is None else str(path), "connect": list(connect) or None, "workers": workers}
     server = load_settings(TileServerConfig, "store", config_file, changes, options)
     if dump_config:
@@ -103,9 +111,14 @@ def store(
             checks = {**store_checks(opened, bus), **certificate_checks(bus.certificate)}
             stack.enter_context(HealthServer(metrics_port, registry, checks, host=metrics_host))
         counts = opened.counts()
-        click.echo(f"tile server: {counts.tiles} tiles of {server.path} at {', '.join(server.connect)}; Ctrl-C ends it")
+        click.echo(
+            f"tile server: {counts.tiles} tiles of {opened.location} at {', '.join(server.connect)}; Ctrl-C ends it"
+        )
         wait_for_stop(stop)
     click.echo("tile server ended")
+
+
+store.add_command(copy)
 
 
 @click.group(name="map")
@@ -113,37 +126,37 @@ def map_group() -> None:
     """Inspect, compare, export and roll back maps; `gnd map build` is in `deploy.map_cli`, above the segmentation."""
 
 
-for _command in (status, survey, *upkeep_cli.COMMANDS):
+for _command in (status, survey, bodies, *upkeep_cli.COMMANDS):
     map_group.add_command(_command)
 
 
 @map_group.command(short_help="What a store holds, in numbers.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.option("--deep", is_flag=True, help="Decode every tile: Gaussians, features, heights.")
 @region_option
 @layer_option
 @json_option
-def info(path: Path, deep: bool, region: str, layer: str, as_json: bool) -> None:
+def info(path: StoreLocation, deep: bool, region: str, layer: str, as_json: bool) -> None:
     """What STORE holds: its newest versions in numbers, its queue and its quarantine."""
     with to_read(path) as opened:
         totals = (layer_info if deep else layer_totals)(opened, layer=layer, prefix=region)
         values = {"layers": opened.layers()} | totals.as_dict()
         values["store"] = asdict(opened.counts())
-    show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
+    show(values, as_json, lambda console: console.print(tables.info(shown(path), values)))
 
 
 @map_group.command(short_help="A tile's versions and their reports.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("tile")
 @layer_option
 @json_option
-def history(path: Path, tile: str, layer: str, as_json: bool) -> None:
+def history(path: StoreLocation, tile: str, layer: str, as_json: bool) -> None:
     """The versions of TILE (path, number, or lat,lon in degrees), and the reports that each comes from."""
     tile_id = parse_tile(tile)
     with to_read(path) as opened:
         lines = opened.history(layer, tile_id)
         if not lines:
-            raise StoreError(f"tile {tile_id.path} of layer {layer} is not in {path}")
+            raise StoreError(f"tile {tile_id.path} of layer {layer} is not in {shown(path)}")
         rows = [
             asdict(line) | {"sha": line.sha.hex(), "reports": opened.provenance(layer, tile_id, line.version)}
             for line in lines
@@ -153,10 +166,10 @@ def history(path: Path, tile: str, layer: str, as_json: bool) -> None:
 
 
 @map_group.command(short_help="The messages that were refused, and why.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.option("--save", type=PATH, help="Write the refused bytes into this folder, a file each.")
 @json_option
-def quarantine(path: Path, save: Path | None, as_json: bool) -> None:
+def quarantine(path: StoreLocation, save: Path | None, as_json: bool) -> None:
     """The messages that were refused, and why."""
     with to_read(path) as opened:
         found = opened.quarantined()
@@ -180,17 +193,18 @@ def _save(files: dict[str, bytes], folder: Path) -> None:
 
 
 @contextmanager
-def store_to_fill(path: Path) -> Iterator[SqliteStore]:
-    """The store at `path`; a new one gets its name only when it is filled."""
-    if path.exists():
-        with SqliteStore(path) as opened:
+def store_to_fill(location: StoreLocation) -> Iterator[SqlStore]:
+    """The store at a location, to publish in; a new file gets its name only when it is filled."""
+    path, signing = file_of(location), Signing.of_environment()
+    if path is None or path.exists():
+        with open_store(location, signing=signing) as opened:
             yield opened
         return
     if not path.parent.is_dir():
         raise StoreError(f"{path}: the folder {path.parent} does not exist")
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        with SqliteStore(partial) as opened:
+        with SqliteStore(partial, signing=signing) as opened:
             yield opened
         partial.rename(path)
     finally:

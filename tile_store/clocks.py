@@ -27,6 +27,21 @@ def boot_id() -> str:
         return "unknown"
 
 
+class MachineClock:
+    """The clock of the queue of a store that the processes of one machine share."""
+
+    @property
+    def name(self) -> str:
+        """This boot of this machine."""
+        return boot_id()
+
+    def steady_ns(self) -> int:
+        """Now, ns; it never steps."""
+        return steady_ns()
+
+
+MACHINE: Final = MachineClock()
+
 OFFSET_FILE: Final = "GND_CLOCK_OFFSET_FILE"
 """Environment: a file of 8 bytes, int64 little-endian ns, by which the time of day is wrong (`gnd chaos` steps it)."""
 

@@ -5,7 +5,9 @@ StoreError             a store cannot do what was asked
 StoreUnavailable     it cannot be opened: no such file, no permission, not a store, a newer schema
 StoreDamaged       a part of it cannot be read
 StoreBusy            another process has held the write lock for too long
+StoreMoved         it was copied to another database, which is used instead
 StoreClosed          it was used after close()
+NotPublished         signed versions, and nobody to sign another one
 UnknownVersion       the tile has no such version
 UnknownReports       a publication names reports that the store does not hold
 IdTaken              a report has the id of another vehicle's
@@ -26,6 +28,20 @@ class StoreDamaged(StoreUnavailable):
     """A page of the store cannot be read; what does not lie on it can."""
 
 
+class StoreMoved(StoreUnavailable):
+    """The store was copied to another database, which is to be used instead."""
+
+    def __init__(self, location: str, line: str) -> None:
+        target = line.partition("moved to ")[2].split(" CONTEXT:")[0].strip()
+        super().__init__(f"{location}: moved to {target}; nothing was written, start this with that store")
+
+
+def odd_row(location: str, error: Exception) -> StoreDamaged:
+    """The error of a store of which a row cannot be read as what it should be."""
+    reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    return StoreDamaged(f"{location}: holds a row that no store has ({reason}); see `gnd map check`")
+
+
 class StoreBusy(StoreError):
     """Another process has held the write lock for longer than `BUSY_TIMEOUT_S`."""
 
@@ -34,12 +50,20 @@ class StoreClosed(StoreError):
     """The store was used after close()."""
 
 
+class NotPublished(StoreError):
+    """The versions of the store are signed, and whoever wants to publish has no identity to sign with."""
+
+
 class UnknownVersion(StoreError):
     """The tile has no such version, or retention has removed it."""
 
 
 class UnknownReports(StoreError):
     """A publication names reports that the store does not hold for its tile."""
+
+
+class ImpossiblePlace(StoreError):
+    """A vehicle says to have been where it cannot have been, by its other reports."""
 
 
 class IdTaken(StoreError):

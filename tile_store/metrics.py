@@ -1,7 +1,6 @@
 """What a store shows of itself to Prometheus, and when it is ill."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Final
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -9,8 +8,8 @@ from prometheus_client.registry import Collector
 
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.health import Check
-from gnd.tile_store.sqlite_connection import change, fetch
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.connection import change, fetch
+from gnd.tile_store.sqlite_store import SqlStore
 
 OVERDUE_S: Final = 60.0
 """A tile that has been ready for so long and is not merged makes the store ill."""
@@ -19,7 +18,7 @@ OVERDUE_S: Final = 60.0
 class StoreCollector(Collector):
     """The store's counts, read when Prometheus asks; all cheap, whatever the store's size."""
 
-    def __init__(self, store: SqliteStore) -> None:
+    def __init__(self, store: SqlStore) -> None:
         self._store = store
 
     def collect(self) -> Iterator[Metric]:
@@ -51,12 +50,12 @@ class StoreCollector(Collector):
             alive.add_metric([shard.owner], shard.is_alive)
         yield alive
         size = GaugeMetricFamily("gnd_store_file_bytes", "Size of the store's files.", labels=["file"])
-        for suffix in ("", "-wal"):
-            size.add_metric([suffix or "store"], _size(Path(f"{store.path}{suffix}")))
+        for name, n_bytes in store.sizes().items():
+            size.add_metric([name], n_bytes)
         yield size
 
 
-def store_checks(store: SqliteStore, bus: Bus) -> dict[str, Check]:
+def store_checks(store: SqlStore, bus: Bus) -> dict[str, Check]:
     """What makes a process over a store ill: it cannot write, the queue stands still, no router."""
 
     def can_write() -> None:
@@ -73,10 +72,3 @@ def store_checks(store: SqliteStore, bus: Bus) -> dict[str, Check]:
 
 def _gauge(name: str, what: str, value: float) -> GaugeMetricFamily:
     return GaugeMetricFamily(name, what, value=value)
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0

@@ -29,9 +29,14 @@ STEPS: Final = (
     (10, "schema_of_turns"),
     (11, "schema_of_trust"),
     (12, "schema_of_trials"),
+    (13, "schema_of_signatures"),
+    (14, "schema_of_owners"),
+    (15, "schema_of_standings"),
+    (16, "schema_of_bodies"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
-_TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks")
+_TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks", "copy_notes_", "moved_away_")
+"""Triggers of a store; the last two begin the names of those of a copy (`copying`)."""
 
 
 def schema_of(connection: apsw.Connection, path: Path) -> int:
@@ -66,7 +71,7 @@ def _check_makeup(connection: apsw.Connection, path: Path) -> None:
         " AND (type <> 'table' OR NOT strict)"
         " UNION ALL SELECT type, name FROM sqlite_schema WHERE type = 'trigger'"
     ).fetchall()
-    strange = [(kind, name) for kind, name in found if kind != "trigger" or name not in _TRIGGERS]
+    strange = [(kind, name) for kind, name in found if kind != "trigger" or not name.startswith(_TRIGGERS)]
     if strange:
         kind, name = strange[0]
         raise StoreUnavailable(f"{path}: not a tile store as any release has made one: {kind} {str(name)[:80]!r}")

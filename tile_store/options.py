@@ -11,7 +11,9 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.location import StoreLocation, file_of, open_store
+from gnd.tile_store.signing import Signing
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER
 
 PATH: Final = click.Path(path_type=Path)
@@ -34,15 +36,23 @@ def json_option(command: _F) -> _F:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")(command)
 
 
-def existing(path: Path) -> SqliteStore:
+def existing(location: StoreLocation) -> SqlStore:
     """A store that is there, to write to."""
-    return SqliteStore(path, create=False)
+    return open_store(location, create=False)
 
 
-def to_read(path: Path) -> SqliteStore:
+def to_publish(location: StoreLocation) -> SqlStore:
+    """A store that is there, to publish in: with the identity of this process, where it has one."""
+    return open_store(location, create=False, signing=Signing.of_environment())
+
+
+def to_read(location: StoreLocation) -> SqlStore:
     """A store that is there, to read; also where nothing can be written."""
+    path = file_of(location)
+    if path is None:
+        return open_store(location, create=False, read_only=True)
     is_writable = os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
-    return SqliteStore(path, create=False, read_only=path.is_file() and not is_writable)
+    return open_store(path, create=False, read_only=path.is_file() and not is_writable)
 
 
 def show(values: dict[str, Any], as_json: bool, print_it: Callable[[Console], None]) -> None:

@@ -4,29 +4,27 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import apsw
-
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile import diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
-from gnd.tile_store import sqlite_inbox as inbox
-from gnd.tile_store import sqlite_trials as trials
-from gnd.tile_store import sqlite_versions as versions
+from gnd.tile_store import sql_inbox as inbox
+from gnd.tile_store import sql_trials as trials
+from gnd.tile_store import sql_versions as versions
+from gnd.tile_store.connection import SqlConnection, change, fetch
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.provenance import Provenance, decode_provenance
-from gnd.tile_store.sqlite_connection import change, fetch
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.trials import VersionTrial
 
 Verdict = Mapping[str, Any]
 
 
-def release(store: SqliteStore, trial: VersionTrial, who: str, why: str, verdict: Verdict | None = None) -> bool:
+def release(store: SqlStore, trial: VersionTrial, who: str, why: str, verdict: Verdict | None = None) -> bool:
     """The version is everybody's from now on, and its notice goes out; False: the trial was settled already."""
 
-    def work(c: apsw.Connection, now: int) -> bool:
+    def work(c: SqlConnection, now: int) -> bool:
         if not trials.set_state(c, trial, "released", _text(trial, verdict), now):
             return False
         place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
@@ -37,7 +35,7 @@ def release(store: SqliteStore, trial: VersionTrial, who: str, why: str, verdict
     return store.transact(work)
 
 
-def withdraw(store: SqliteStore, trial: VersionTrial, who: str, why: str, verdict: Verdict | None = None) -> bool:
+def withdraw(store: SqlStore, trial: VersionTrial, who: str, why: str, verdict: Verdict | None = None) -> bool:
     """The content before the trial becomes the next version, and the reports behind the trial are doubted; False: the
     trial was settled already.
 
@@ -45,21 +43,21 @@ def withdraw(store: SqliteStore, trial: VersionTrial, who: str, why: str, verdic
     """
     report_ids = behind(store, trial)
 
-    def work(c: apsw.Connection, now: int) -> bool:
+    def work(c: SqlConnection, now: int) -> bool:
         if not trials.set_state(c, trial, "withdrawn", _text(trial, verdict), now):
             return False
         trials.doubt(c, trial, report_ids, now)
-        versions.rollback(c, trial.layer, trial.tile, trial.base_version, now)
+        versions.rollback(c, trial.layer, trial.tile, trial.base_version, now, store.signing)
         trials.steer(c, trial, who, "withdrawn", why, now)
         return True
 
     return store.transact(work)
 
 
-def hold(store: SqliteStore, trial: VersionTrial, who: str, why: str, *, paused: bool) -> bool:
+def hold(store: SqlStore, trial: VersionTrial, who: str, why: str, *, paused: bool) -> bool:
     """Nothing is decided until somebody does, or (not paused) by what vehicles tell; False: it was settled already."""
 
-    def work(c: apsw.Connection, now: int) -> bool:
+    def work(c: SqlConnection, now: int) -> bool:
         if not trials.set_state(c, trial, "paused" if paused else "trial", trial.verdict, now):
             return False
         trials.steer(c, trial, who, "paused" if paused else "resumed", why, now)
@@ -68,21 +66,21 @@ def hold(store: SqliteStore, trial: VersionTrial, who: str, why: str, *, paused:
     return store.transact(work)
 
 
-def note_verdict(store: SqliteStore, trial: VersionTrial, verdict: Verdict) -> None:
+def note_verdict(store: SqlStore, trial: VersionTrial, verdict: Verdict) -> None:
     """Keep how far a trial has come, for who looks."""
     text = _text(trial, verdict)
     if text != trial.verdict and trial.state != "paused":
         store.transact(lambda c, now: trials.set_state(c, trial, trial.state, text, now))
 
 
-def clear(store: SqliteStore, layer: str, tile: TileId, who: str, why: str) -> int:
+def clear(store: SqlStore, layer: str, tile: TileId, who: str, why: str) -> int:
     """The doubted reports about a tile are believed again, and the tile waits to be merged; how many were doubted.
 
     Raises:
         StoreError: none are.
     """
 
-    def work(c: apsw.Connection, now: int) -> int:
+    def work(c: SqlConnection, now: int) -> int:
         known = trials.of_tile(c, layer, tile)
         cleared = trials.clear_doubts(c, layer, tile, who, now)
         if not known or not cleared:
@@ -94,7 +92,7 @@ def clear(store: SqliteStore, layer: str, tile: TileId, who: str, why: str) -> i
     return store.transact(work)
 
 
-def behind(store: SqliteStore, trial: VersionTrial) -> tuple[str, ...]:
+def behind(store: SqlStore, trial: VersionTrial) -> tuple[str, ...]:
     """The reports that the voxels come from in which a version on trial differs from the one before; where the store
     does not know them by voxel, all that the version has and the one before has not.
     """
@@ -109,7 +107,7 @@ def behind(store: SqliteStore, trial: VersionTrial) -> tuple[str, ...]:
     return tuple(sorted(found or set(of_new.report_ids) - set(of_old.report_ids) or of_new.report_ids))
 
 
-def changed_voxels(store: SqliteStore, trial: VersionTrial) -> frozenset[int]:
+def changed_voxels(store: SqlStore, trial: VersionTrial) -> frozenset[int]:
     """The voxels in which a version on trial differs from the one before."""
     old = store.get(trial.layer, trial.tile, trial.base_version)
     new = store.get(trial.layer, trial.tile, trial.version)
@@ -125,7 +123,7 @@ def _differing(old: AnyTile, new: AnyTile) -> frozenset[int]:
     return frozenset(delta.removed.tolist()) | frozenset(delta.put.voxel_id.tolist())
 
 
-def _provenance(store: SqliteStore, trial: VersionTrial, version: int) -> Provenance:
+def _provenance(store: SqlStore, trial: VersionTrial, version: int) -> Provenance:
     place = {"layer": trial.layer, "tile": trial.tile.morton, "version": version}
     rows = store.look(lambda c: fetch(c, "provenance", place))
     if not rows:

@@ -4,14 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeVar
 
-import apsw
-
+from gnd.tile_store.connection import Lock, SqlConnection, change, fetch
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.sqlite_connection import change, fetch
 from gnd.tile_store.values import GcResult
 
 T = TypeVar("T")
 NS_A_DAY: Final = 86_400_000_000_000
+QUARANTINE: Final[Lock] = ("quarantine",)
+"""One writer at a time refuses messages: the bound on what is kept is one for all."""
 ROWS_AT_ONCE: Final = 1000  # so that reports which arrive meanwhile need not wait
 
 
@@ -24,7 +24,7 @@ class Collectable(Protocol):
     def forget_uploads(self, before_ns: int) -> int:
         """See `Store.forget_uploads`."""
 
-    def transact(self, work: Callable[[apsw.Connection, int], T]) -> T:
+    def transact(self, work: Callable[[SqlConnection, int], T]) -> T:
         """Run `work(connection, now)` in one durable write transaction."""
 
 
@@ -57,7 +57,8 @@ def retain(
     Args:
         store: in use or not.
         keep_versions: so many of the newest versions of each tile stay.
-        keep_days: reports that count no more and refused messages stay so long after receipt.
+        keep_days: reports that count no more and refused messages stay so long after receipt, and so long what is known
+            of vehicles' places and of how they stood.
         quarantine_mb: of the newest refused messages so much stays.
         folded: reports that are folded into the memory of their tile count no more, either: the map stays as it is, but
             the versions made of them cannot be computed anew.
@@ -72,6 +73,7 @@ def retain(
         uploads = store.forget_uploads(store.transact(lambda _c, now: now - days_ns))
         reports += _older_than(store, "forget_reports", keep_days, folded=folded)
         refused += _older_than(store, "forget_old_quarantined", keep_days)
+        store.transact(lambda c, now: _forget_vehicles(c, now - days_ns))
     trimmed = (0, 0)
     if quarantine_mb is not None:
         trimmed = store.transact(lambda c, _now: trim_quarantine(c, round(quarantine_mb * 1e6)))
@@ -87,13 +89,21 @@ def retain(
     )
 
 
-def trim_quarantine(c: apsw.Connection, max_bytes: int) -> tuple[int, int]:
+def trim_quarantine(c: SqlConnection, max_bytes: int) -> tuple[int, int]:
     """Remove the oldest refused messages until they are within a bound; how many and how many bytes went."""
     before = fetch(c, "quarantine_size")[0]
     while fetch(c, "quarantine_size")[0][1] > max_bytes and change(c, "forget_quarantined", {}):
         pass
     after = fetch(c, "quarantine_size")[0]
     return before[0] - after[0], before[1] - after[1]
+
+
+def _forget_vehicles(c: SqlConnection, before_ns: int) -> None:
+    """What is known of vehicles since then: how they stood, what they changed alone, where they were. Who is not
+    believed alone stays so.
+    """
+    for what in ("standings", "days_alone", "old_places", "impossible"):
+        change(c, f"forget_{what}", {"before": before_ns})
 
 
 def _older_than(store: Collectable, statement: str, days: float, **more: bool) -> list[int]:

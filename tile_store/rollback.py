@@ -4,18 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-import apsw
-
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import FeatureTile, is_feature_layer
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
-from gnd.tile_store import sqlite_versions as versions
+from gnd.tile_store import sql_versions as versions
+from gnd.tile_store.connection import SqlConnection, fetch
 from gnd.tile_store.errors import StoreError, UnknownVersion
 from gnd.tile_store.regions import morton_range
-from gnd.tile_store.sqlite_connection import fetch
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import Content
 
 Action = Literal["rollback", "empty", "same", "unknown"]
@@ -49,7 +47,7 @@ class RollbackStep:
     action: Action
 
 
-def plan(store: SqliteStore, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
+def plan(store: SqlStore, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
     """What a rollback of a tile or a region (path prefix) would do, by tile.
 
     Raises:
@@ -59,22 +57,23 @@ def plan(store: SqliteStore, layer: str, region: TileId | str, to: RollbackTarge
     return store.look(lambda c: _plan(c, layer, region, to))
 
 
-def roll_back(store: SqliteStore, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
+def roll_back(store: SqlStore, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
     """Do what `plan` says of the store as it is now, all or nothing; every tile that changes begins a new epoch."""
 
-    def work(c: apsw.Connection, now: int) -> list[RollbackStep]:
+    def work(c: SqlConnection, now: int) -> list[RollbackStep]:
         steps = _plan(c, layer, region, to)
         for step in steps:
             if step.action == "rollback":
-                versions.rollback(c, layer, step.tile, step.to_version, now)
+                versions.rollback(c, layer, step.tile, step.to_version, now, store.signing)
             elif step.action == "empty":
-                versions.put_base(c, layer, step.tile, Content.of(_empty(layer, step.tile)), "rollback", now)
+                content = Content.of(_empty(layer, step.tile))
+                versions.put_base(c, layer, step.tile, content, "rollback", now, signing=store.signing)
         return steps
 
     return store.transact(work)
 
 
-def _plan(c: apsw.Connection, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
+def _plan(c: SqlConnection, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
     heads = _heads(c, layer, region)
     if to.version is not None:
         if not isinstance(region, TileId):
@@ -84,7 +83,7 @@ def _plan(c: apsw.Connection, layer: str, region: TileId | str, to: RollbackTarg
     return [_to_time(c, layer, tile, head, sha, to.at_ns) for tile, head, sha in heads]
 
 
-def _heads(c: apsw.Connection, layer: str, region: TileId | str) -> Sequence[tuple[TileId, int, bytes]]:
+def _heads(c: SqlConnection, layer: str, region: TileId | str) -> Sequence[tuple[TileId, int, bytes]]:
     first, end = (region.morton, region.morton + 1) if isinstance(region, TileId) else morton_range(region)
     rows = fetch(c, "heads", {"layer": layer, "first": first, "end": end})
     if not rows:
@@ -93,14 +92,14 @@ def _heads(c: apsw.Connection, layer: str, region: TileId | str) -> Sequence[tup
     return [(TileId(tile), version, sha) for tile, version, sha in rows]
 
 
-def _to_version(c: apsw.Connection, layer: str, tile: TileId, head: int, sha: bytes, version: int) -> RollbackStep:
+def _to_version(c: SqlConnection, layer: str, tile: TileId, head: int, sha: bytes, version: int) -> RollbackStep:
     rows = fetch(c, "sha_of_version", {"layer": layer, "tile": tile.morton, "version": version})
     if not rows:
         raise UnknownVersion(f"tile {tile.path} of layer {layer} has no version {version} (newest: {head})")
     return RollbackStep(tile, head, version, "same" if rows[0][0] == sha else "rollback")
 
 
-def _to_time(c: apsw.Connection, layer: str, tile: TileId, head: int, sha: bytes, at_ns: int) -> RollbackStep:
+def _to_time(c: SqlConnection, layer: str, tile: TileId, head: int, sha: bytes, at_ns: int) -> RollbackStep:
     place = {"layer": layer, "tile": tile.morton}
     found = fetch(c, "version_at", place | {"at_ns": at_ns})
     version = found[0][0] if found else 0

@@ -1,11 +1,13 @@
 """The tile server: answers tile and catalog queries from a store. All that it remembers is what it has encoded."""
 
+import logging
 from collections.abc import Iterator
 from itertools import groupby
 from typing import Final, Self
 
 from gnd.fleet_bus.bus import Bus
-from gnd.fleet_bus.errors import Refused
+from gnd.fleet_bus.errors import NotMine, Refused
+from gnd.fleet_bus.sealing import CERTIFICATE_ROOT
 from gnd.fleet_bus.serving import Answer, Request, Serving
 from gnd.gnd_map.codec import CODEC_FLOAT32
 from gnd.gnd_map.content import FEATURE_CODECS
@@ -22,6 +24,7 @@ from gnd.tile_store.store import Store
 from gnd.tile_store.warm import warm_up
 
 # Four districts: 40 MB of tiles of a dense city, and what a wildcard may cost everybody else.
+_LOG = logging.getLogger(__name__)
 MOST_TILES_OF_REGION: Final = 4 * MAX_TILES_OF_DISTRICT
 _ANY: Final = "x/**"
 # Only `gnd.schemas.keys` knows how a key begins.
@@ -62,6 +65,10 @@ class TileServer:
         ):
             serving = self._bus.serve(keyexpr, handler, complete=True, workers=self._workers, kind=kind)
             self._servings.append(serving)
+        if self._bus.config.identity is not None:  # others may have them, too: shards their own
+            self._servings.append(self._bus.serve(f"{CERTIFICATE_ROOT}/*", self.certificates, kind="control"))
+            if n := self._store.unsigned():
+                _LOG.warning("nobody has signed %d tiles of this store: no client takes them (`gnd map sign`)", n)
         return self
 
     def close(self) -> None:
@@ -113,6 +120,21 @@ class TileServer:
         except SchemaError as error:
             raise _refusal(request, error) from None
         return self._catalogs(region)
+
+    def certificates(self, request: Request) -> Answer:
+        """The certificates of who has signed versions of the store, by id, also of those who are gone.
+
+        Raises:
+            NotMine: nobody of that id has.
+        """
+        try:
+            signer = bytes.fromhex(request.key.rpartition("/")[2])
+        except ValueError:
+            raise NotMine from None
+        chain = self._store.publisher_chain(signer)
+        if chain is None:
+            raise NotMine
+        return chain
 
     def _region(self, found: list[tuple[str, TileId]], wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
         for layer, tile in found:

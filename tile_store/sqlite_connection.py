@@ -4,16 +4,25 @@ import os
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Final, Literal, TypeVar
+from typing import Final, Literal, TypeVar
 from urllib.parse import quote
 
 import apsw
 
-from gnd.tile_store.errors import StoreBusy, StoreClosed, StoreDamaged, StoreError, StoreUnavailable
+from gnd.tile_store import clocks
+from gnd.tile_store.connection import NOTHING, Bindings, Row
+from gnd.tile_store.errors import (
+    StoreBusy,
+    StoreClosed,
+    StoreDamaged,
+    StoreError,
+    StoreMoved,
+    StoreUnavailable,
+    odd_row,
+)
 from gnd.tile_store.migrations import SCHEMA_VERSION, migrate, schema_of
 from gnd.tile_store.sql import statements
 
@@ -29,19 +38,44 @@ NO_ROW: Final = (TypeError, ValueError, KeyError, IndexError, ArithmeticError, A
 
 
 T = TypeVar("T")
-Row = tuple[Any, ...]
-Bindings = Mapping[str, Any]
 
 
-def fetch(connection: apsw.Connection, statement: str, bindings: Bindings = MappingProxyType({})) -> list[Row]:
-    """All rows of a named statement."""
-    return list(connection.execute(SQL[statement], bindings))
+class SqliteConnection(apsw.Connection):
+    """`SqlConnection` to an SQLite file."""
 
+    @property
+    def clock(self) -> clocks.MachineClock:
+        """The machine's: all processes that share a file see the same."""
+        return clocks.MACHINE
 
-def change(connection: apsw.Connection, statement: str, bindings: Bindings) -> int:
-    """Run a named statement; the number of rows that it changed."""
-    connection.execute(SQL[statement], bindings)
-    return connection.changes()
+    def fetch(self, statement: str, bindings: Bindings = NOTHING) -> list[Row]:
+        """All rows of a named statement."""
+        return list(self.execute(SQL[statement], bindings))
+
+    def change(self, statement: str, bindings: Bindings = NOTHING) -> int:
+        """Run a named statement; the number of rows that it changed."""
+        self.execute(SQL[statement], bindings)
+        return self.changes()
+
+    def post(self, statement: str, bindings: Bindings = NOTHING) -> None:
+        """Run a named statement."""
+        self.execute(SQL[statement], bindings)
+
+    def fetch_each(self, statement: str, each: Sequence[Bindings], shared: Bindings = NOTHING) -> list[list[Row]]:
+        """All rows of a named statement, for each of several bindings."""
+        return [self.fetch(statement, {**shared, **one}) for one in each]
+
+    def ask_each(
+        self, statement: str, each: Sequence[Bindings], shared: Bindings = NOTHING
+    ) -> Callable[[], list[list[Row]]]:
+        """All rows of a named statement, for each of several bindings."""
+        found = self.fetch_each(statement, each, shared)
+        return lambda: found
+
+    def post_each(self, statement: str, each: Sequence[Bindings], shared: Bindings = NOTHING) -> None:
+        """Run a named statement for each of several bindings."""
+        for one in each:
+            self.execute(SQL[statement], {**shared, **one})
 
 
 def as_store_error(error: Exception, path: str | Path, *, to_write: bool = True) -> Exception:
@@ -54,6 +88,8 @@ def as_store_error(error: Exception, path: str | Path, *, to_write: bool = True)
         return StoreUnavailable(f"{path}: not a tile store (not an SQLite database); choose another path")
     if isinstance(error, (apsw.CantOpenError, apsw.ReadOnlyError, apsw.PermissionsError)):
         return StoreUnavailable(f"{path}: cannot be opened for writing; its folder must exist and be writable")
+    if isinstance(error, apsw.ConstraintError) and "moved to " in str(error):
+        return StoreMoved(str(path), str(error))
     if isinstance(error, apsw.FullError):
         return StoreUnavailable(f"{path}: disk full; free space and try again, nothing was changed")
     if isinstance(error, apsw.CorruptError):
@@ -65,7 +101,7 @@ def as_store_error(error: Exception, path: str | Path, *, to_write: bool = True)
     return error
 
 
-def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> apsw.Connection:
+def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> SqliteConnection:
     """A connection for writing: WAL, every commit synced to disk, schema checked (and made when the file is new)."""
     if tuple(map(int, apsw.sqlite_lib_version().split("."))) < OLDEST_SQLITE:
         raise StoreUnavailable(f"SQLite {apsw.sqlite_lib_version()} can corrupt a shared WAL; install apsw >= 3.52")
@@ -73,7 +109,7 @@ def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> apsw.Conn
         raise StoreUnavailable(f"{path}: no such store; `gnd map build` makes one")
     flags = apsw.SQLITE_OPEN_READWRITE | (apsw.SQLITE_OPEN_CREATE if create else 0)
     try:
-        connection = apsw.Connection(str(path), flags=flags)
+        connection = SqliteConnection(str(path), flags=flags)
     except apsw.Error as error:
         raise as_store_error(error, path) from None
     try:
@@ -87,7 +123,7 @@ def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> apsw.Conn
     return connection
 
 
-def open_reader(path: Path) -> apsw.Connection:
+def open_reader(path: Path) -> SqliteConnection:
     """A connection that changes nothing, also where nothing can be written: in a folder or on a disk that is read-only.
 
     There a store can be read that was closed cleanly, or whose log is in use by a process that may write.
@@ -129,8 +165,8 @@ def require_current(path: Path) -> None:
         )
 
 
-def _opened_reader(name: str, path: Path, flags: int) -> apsw.Connection:
-    connection = apsw.Connection(name, flags=apsw.SQLITE_OPEN_READONLY | flags)
+def _opened_reader(name: str, path: Path, flags: int) -> SqliteConnection:
+    connection = SqliteConnection(name, flags=apsw.SQLITE_OPEN_READONLY | flags)
     try:
         connection.set_busy_handler(_Patience(READER_PATIENCE_S))
         connection.pragma("trusted_schema", False)
@@ -191,20 +227,24 @@ class ReaderPool:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._idle: list[apsw.Connection] = []
+        self._idle: list[SqliteConnection] = []
         self._lock = threading.Lock()
         self._closed = False
 
     @contextmanager
-    def snapshot(self) -> Iterator[apsw.Connection]:
+    def snapshot(self) -> Iterator[SqliteConnection]:
         """A connection on which everything is read at one instant."""
         with self.connection() as connection:
             connection.execute("BEGIN")
             yield connection
             connection.execute("COMMIT")
 
+    def single(self) -> AbstractContextManager[SqliteConnection]:
+        """The same."""
+        return self.snapshot()
+
     @contextmanager
-    def connection(self) -> Iterator[apsw.Connection]:
+    def connection(self) -> Iterator[SqliteConnection]:
         """A connection outside any transaction; it is not used again after an error."""
         connection = self._take()
         try:
@@ -214,10 +254,7 @@ class ReaderPool:
             raise as_store_error(error, self._path) from None
         except NO_ROW as error:
             connection.close()
-            reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-            raise StoreDamaged(
-                f"{self._path}: holds a row that no store has ({reason}); see `gnd map check`"
-            ) from error
+            raise odd_row(str(self._path), error) from error
         except BaseException:
             connection.close()
             raise
@@ -231,7 +268,7 @@ class ReaderPool:
         for connection in idle:
             connection.close()
 
-    def _take(self) -> apsw.Connection:
+    def _take(self) -> SqliteConnection:
         with self._lock:
             if self._closed:
                 raise StoreClosed(f"{self._path}: the store is closed")
@@ -239,7 +276,7 @@ class ReaderPool:
                 return self._idle.pop()
         return open_reader(self._path)
 
-    def _give_back(self, connection: apsw.Connection) -> None:
+    def _give_back(self, connection: SqliteConnection) -> None:
         with self._lock:
             if not self._closed:
                 self._idle.append(connection)

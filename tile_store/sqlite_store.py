@@ -1,48 +1,58 @@
 """The store in one SQLite file that several processes of a machine may open (WAL, every commit synced)."""
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, TypeVar
-
-import apsw
+from typing import Any, Final, Protocol, Self, TypeVar
 
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_store import clocks
-from gnd.tile_store import sqlite_accounts as accounts
-from gnd.tile_store import sqlite_confirmation as confirmation
-from gnd.tile_store import sqlite_inbox as inbox
-from gnd.tile_store import sqlite_journal as journal
-from gnd.tile_store import sqlite_refuted as refuted
-from gnd.tile_store import sqlite_roads as roads
-from gnd.tile_store import sqlite_trials as trials
-from gnd.tile_store import sqlite_trust as trust
-from gnd.tile_store import sqlite_uploads as uploads
-from gnd.tile_store import sqlite_versions as versions
+from gnd.tile_store import sql_accounts as accounts
+from gnd.tile_store import sql_confirmation as confirmation
+from gnd.tile_store import sql_inbox as inbox
+from gnd.tile_store import sql_journal as journal
+from gnd.tile_store import sql_refuted as refuted
+from gnd.tile_store import sql_roads as roads
+from gnd.tile_store import sql_standing as standing
+from gnd.tile_store import sql_trials as trials
+from gnd.tile_store import sql_trust as trust
+from gnd.tile_store import sql_uploads as uploads
+from gnd.tile_store import sql_versions as versions
 from gnd.tile_store.backup import copy_store
-from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownVersion
+from gnd.tile_store.bodies import Bodies, bodies_at, place_of_bodies
+from gnd.tile_store.connection import QueueClock, SqlConnection, Writer, change, fetch
+from gnd.tile_store.errors import StoreDamaged, StoreError, StoreMoved, UnknownVersion
 from gnd.tile_store.provenance import Provenance, decode_provenance
 from gnd.tile_store.regions import morton_range
-from gnd.tile_store.retention import trim_quarantine
+from gnd.tile_store.retention import QUARANTINE, trim_quarantine
 from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.rows_kept import RowsKept
-from gnd.tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
+from gnd.tile_store.signing import Signing, chain_of, check_signed
+from gnd.tile_store.sqlite_connection import ReaderPool, open_writer, require_current
+from gnd.tile_store.sqlite_writer import SqliteWriter
 from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from gnd.tile_store.values import (
     DEFAULT_LAYER,
+    NS_PER_S,
     Basis,
     Claim,
     ClosedWindow,
     Content,
+    DayAlone,
     DirtyTile,
     GcResult,
     HeadLine,
+    ImpossibleSaid,
     JournalMark,
+    LoneWord,
     Notice,
     Publication,
     PublishResult,
@@ -58,6 +68,7 @@ from gnd.tile_store.values import (
     TileSetAside,
     TileWork,
     VehicleAccount,
+    VehiclePair,
     VehicleTrust,
     VersionInfo,
     VersionKind,
@@ -66,10 +77,9 @@ from gnd.tile_store.values import (
     check_fits,
     check_layer,
 )
-from gnd.tile_store.writer import GroupWriter, NoWriter
+from gnd.tile_store.writer import NoWriter
 
 _T = TypeVar("_T")
-NS_PER_S: Final = 1_000_000_000
 BUSY_TIMEOUT_S: Final = 30.0
 """A writer waits this long for the writers of other processes."""
 GROUP_MAX: Final = 256
@@ -83,45 +93,57 @@ WINDOWS_AT_ONCE: Final = 8
 _LOG = logging.getLogger(__name__)
 
 
-class SqliteStore:
-    """`Store` in an SQLite file: one writer thread that groups commits, read-only connections for readers.
+class Readers(Protocol):
+    """Connections that only read."""
+
+    def snapshot(self) -> AbstractContextManager[SqlConnection]:
+        """A connection on which everything is read at one instant."""
+
+    def single(self) -> AbstractContextManager[SqlConnection]:
+        """A connection for one question."""
+
+    def close(self) -> None:
+        """Free them; those in use when they come back."""
+
+
+class SqlStore(ABC):
+    """`Store` over named statements: a writer that groups commits, and connections for readers.
+
+    Whoever inherits from it opens the database. What it says of locks (`about`) is for databases in which several
+    processes write at the same time; see decision 0161 for what each may change beside the others.
 
     Args:
-        path: the file; with `create` it is made when missing (its folder must exist).
+        location: what messages call it.
+        readers, writer: the connections.
         config: batching and waiting of this process.
-        read_only: nothing is written, also not beside the file; whatever would write is StoreUnavailable.
+        signing: who signs what is published, and checks what is built upon; None: nobody does.
         now_ns: the time of day, int ns UTC; it may step.
-        steady_ns: the clock of the queue, ns; it never steps, and is the same in all processes of the machine.
-
-    Raises:
-        StoreUnavailable: no such file or folder, no permission, not a store, written by a newer release.
+        clock: of the queue; one for all processes that share the store.
+        upload_clock: of the leases of uploads, which connections know, too.
     """
 
     def __init__(
         self,
-        path: str | Path,
-        config: StoreConfig | None = None,
-        *,
-        create: bool = True,
-        read_only: bool = False,
-        now_ns: Callable[[], int] = clocks.day_ns,
-        steady_ns: Callable[[], int] = clocks.steady_ns,
+        location: str,
+        readers: Readers,
+        writer: Writer,
+        config: StoreConfig | None,
+        signing: Signing | None,
+        now_ns: Callable[[], int],
+        clock: QueueClock,
+        upload_clock: QueueClock,
     ) -> None:
-        self.path = Path(path)
+        self.location = location
+        self.signing = signing
+        self._readers, self._writer = readers, writer
         self._config = config or StoreConfig()
-        self._now_ns, self._steady_ns = now_ns, steady_ns
-        self._readers = ReaderPool(self.path)
+        self._now_ns, self._clock, self._upload_clock = now_ns, clock, upload_clock
         self._rows = RowsKept()
-        self._writer: GroupWriter | NoWriter
-        if read_only:
-            require_current(self.path)
-            self._writer = NoWriter(self.path)
-        else:
-            connection = open_writer(self.path, create=create, busy_timeout_s=BUSY_TIMEOUT_S)
-            self._writer = GroupWriter(connection, group_max=GROUP_MAX)
-            self._enter_boot()
+        self._turns_after = ""
+        self._owners = trust.OwnersNoted()
+        self._bodies: Bodies | None = None
 
-    def __enter__(self) -> "SqliteStore":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -130,22 +152,65 @@ class SqliteStore:
         self.close()
 
     def close(self) -> None:
-        """Finish what is queued and close the file. Calling it twice is harmless."""
+        """Finish what is queued and free the store. Calling it twice is harmless."""
         self._readers.close()
-        self._writer.close()  # the last connection folds the log into the file, which a reader could not
+        self._writer.close()  # the last connection folds SQLite's log into the file, which a reader could not
+
+    @abstractmethod
+    def backup(self, path: str | Path) -> None:
+        """See `Store.backup`."""
+
+    @abstractmethod
+    def sizes(self) -> dict[str, int]:
+        """What the store takes on disk, bytes, by part."""
+
+    def _steady_ns(self) -> int:
+        return self._clock.steady_ns()
 
     def _enter_boot(self) -> None:
-        """What an earlier boot has left in the queue ends; a store is written to only where there is something."""
+        """What another clock has left in the queue ends; a store is written to only where there is something."""
         try:
             with self._readers.snapshot() as c:
-                is_known = fetch(c, "boot_of_queue") == [(clocks.boot_id(),)]
+                is_known = fetch(c, "boot_of_queue") == [(self._clock.name,)]
             if not is_known:
-                self._writer.run(lambda c: inbox.enter_boot(c, clocks.boot_id(), self._steady_ns()))
-        except StoreDamaged as error:  # what can be read shall be read
+                self._writer.run(lambda c: inbox.enter_boot(c, self._clock.name, self._steady_ns()))
+            place = self.look(place_of_bodies)
+            if place is not None:
+                self._bodies = bodies_at(place, to_write=True)
+        except (StoreDamaged, StoreMoved) as error:  # what can be read shall be read
             _LOG.error("%s", error)
         except BaseException:
             self.close()
             raise
+
+    def whole(self, stored: StoredTile) -> StoredTile:
+        """A version with its body, where it lies among objects.
+
+        Raises:
+            StoreDamaged: it is not there, or nobody says where.
+            StoreUnavailable: the objects cannot be read.
+        """
+        if stored.body:
+            return stored
+        if self._bodies is None:
+            place = self.look(place_of_bodies)
+            if place is None:
+                raise StoreDamaged(
+                    f"tile {stored.tile.path} of layer {stored.layer} version {stored.version}: its body lies among"
+                    " objects, and the store does not say where (`gnd map bodies`)"
+                )
+            self._bodies = bodies_at(place, to_write=False)
+        return replace(stored, body=self._bodies.read(stored.sha, stored.codec_id))
+
+    def _whole(self, stored: StoredTile | None) -> StoredTile | None:
+        return None if stored is None else self.whole(stored)
+
+    def _kept(self, contents: Sequence[Content | None]) -> list[Content | None]:
+        """Contents whose bodies lie among the objects, where the store has any; before the transaction, that is."""
+        if self._bodies is None:
+            return list(contents)
+        kept = iter(self._bodies.keep([one for one in contents if one is not None]))
+        return [None if one is None else next(kept) for one in contents]
 
     def timing(self) -> dict[str, Any]:
         """Now, and when a tile that is marked becomes ready, as statements take it."""
@@ -153,36 +218,47 @@ class SqliteStore:
 
     # Uploads
 
-    def put_upload(self, upload: Upload, home: str) -> PutStatus:
+    def put_upload(self, upload: Upload, home: str, patient_s: float = 0.0) -> PutStatus:
         """See `Store.put_upload`."""
-        return self._writer.run(lambda c: uploads.put(c, upload, home))
+        row = uploads.row_of(upload, home, self._upload_clock)
+        is_new = self._writer.change("insert_upload", row, uploads.locks_of(upload), patient_s)
+        return "stored" if is_new else "duplicate"
 
     def claim_uploads(
         self, owner: str, n: int, lease_s: float, in_turn: uploads.InTurnOf = sorted
     ) -> list[UploadClaim]:
         """See `Store.claim_uploads`."""
-        # As with tiles: who looks often takes no write lock for nothing.
+        # As with tiles: who looks often takes no write lock for nothing, and whose turn it is is found without it.
         with self._readers.snapshot() as c:
             if not uploads.any_claimable(c, owner):
                 return []
-        return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s, in_turn))
+            names, self._turns_after = uploads.turns(c, self._turns_after)
+            is_any_left = uploads.any_left_behind(c)
+        vehicles = in_turn(names)
+        if not vehicles and not is_any_left:
+            return []
+        return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s, vehicles), [inbox.CLAIMS])
 
     def uploads_waiting(self, vehicle: str | None, at_most: int) -> int:
         """See `Store.uploads_waiting`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return uploads.waiting(c, vehicle, at_most)
 
     def postpone_upload(self, claim: UploadClaim, delay_s: float, *, blameless: bool = False) -> None:
         """See `Store.postpone_upload`."""
-        self._writer.run(lambda c: uploads.postpone(c, claim, delay_s, blameless=blameless))
+        self._writer.run(
+            lambda c: uploads.postpone(c, claim, delay_s, blameless=blameless), uploads.locks_of(claim.upload)
+        )
 
     def settle_upload(self, settled: Settled) -> bool:
         """See `Store.settle_upload`."""
-        return self._writer.run(lambda c: uploads.settle(c, settled, self._config, self.timing()))
+        return self._writer.run(
+            lambda c: uploads.settle(c, settled, self._config, self.timing()), uploads.locks_to_settle(settled)
+        )
 
     def first_halves(self, key: str, report_id: str) -> list[FirstHalf]:
         """See `Store.first_halves`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return uploads.first_halves(c, key, report_id)
 
     def first_parts(self, layer: str, report_id: str, tiles: Sequence[TileId]) -> list[ReportRow]:
@@ -212,14 +288,14 @@ class SqliteStore:
 
     def road_reports(self, layer: str) -> set[str]:
         """See `Store.road_reports`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return roads.report_ids(c, layer)
 
     def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
         """See `Store.put_reports`."""
         if not rows:
             return []
-        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._config, self.timing()))
+        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._config, self.timing()), inbox.locks_of(rows))
 
     def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
         """See `Store.reports`."""
@@ -229,15 +305,16 @@ class SqliteStore:
             after, page = self._report_page(layer, vehicle, after)
 
     def _report_page(self, layer: str, vehicle: str | None, after: int) -> tuple[int, list[ReportRow]]:
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return inbox.page(c, layer, vehicle, after, REPORTS_A_PAGE)
 
     def in_play(self, layer: str, tile: TileId) -> TileJournal:
         """See `Store.in_play`."""
         with self._readers.snapshot() as c:
-            return self._in_play(c, layer, tile)
+            journal_of_tile = self._in_play(c, layer, tile)
+        return replace(journal_of_tile, epoch=self._whole(journal_of_tile.epoch))
 
-    def _in_play(self, c: apsw.Connection, layer: str, tile: TileId) -> TileJournal:
+    def _in_play(self, c: SqlConnection, layer: str, tile: TileId) -> TileJournal:
         version = versions.epoch_of(c, layer, tile)
         epoch = versions.stored(c, "stored_version", layer, tile, version=version) if version else None
         first = journal.folded(c, layer, tile, version) + 1
@@ -263,15 +340,15 @@ class SqliteStore:
         """See `Store.quarantine`."""
         row = {"sha": sha256(body).digest(), "source": source, "reason": reason, "body": body}
 
-        def work(c: apsw.Connection) -> None:
+        def work(c: SqlConnection) -> None:
             change(c, "insert_quarantine", row | {"received_ns": self._now_ns()})
             trim_quarantine(c, self._config.quarantine_bytes)
 
-        self._writer.run(work)
+        self._writer.run(work, [QUARANTINE])
 
     def quarantined(self) -> list[Quarantined]:
         """See `Store.quarantined`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return [Quarantined(*row) for row in fetch(c, "quarantined")]
 
     # The queue
@@ -282,11 +359,13 @@ class SqliteStore:
         ready_in_s = self.ready_in_s()
         if ready_in_s is None or ready_in_s > 0.0:
             return []
-        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._steady_ns()))
+        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._steady_ns()), [inbox.CLAIMS])
 
     def begin(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """See `Store.begin`."""
-        return self._writer.run(lambda c: [inbox.begin(c, one, lease_s, self._steady_ns()) for one in claims])
+        return self._writer.run(
+            lambda c: [inbox.begin(c, one, lease_s, self._steady_ns()) for one in claims], inbox.locks_of(claims)
+        )
 
     def release(self, owner: str) -> int:
         """See `Store.release`."""
@@ -294,15 +373,19 @@ class SqliteStore:
 
     def postpone(self, claim: Claim, delay_s: float) -> None:
         """See `Store.postpone`."""
-        self._writer.run(lambda c: inbox.postpone(c, claim, self._steady_ns() + round(delay_s * NS_PER_S)))
+        self._writer.run(
+            lambda c: inbox.postpone(c, claim, self._steady_ns() + round(delay_s * NS_PER_S)), inbox.locks_of([claim])
+        )
 
     def set_aside(self, claim: Claim, reason: str) -> bool:
         """See `Store.set_aside`."""
-        return self._writer.run(lambda c: inbox.set_aside(c, claim, reason, self._now_ns(), self._steady_ns()))
+        return self._writer.run(
+            lambda c: inbox.set_aside(c, claim, reason, self._now_ns(), self._steady_ns()), inbox.locks_of([claim])
+        )
 
     def tiles_set_aside(self) -> list[TileSetAside]:
         """See `Store.tiles_set_aside`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             rows = fetch(c, "tiles_set_aside")
         return [TileSetAside(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
 
@@ -315,10 +398,10 @@ class SqliteStore:
 
     def join(self, owner: str) -> None:
         """See `Store.join`."""
-        boot, steady = clocks.boot_id(), self._steady_ns()
+        boot, steady = self._clock.name, self._steady_ns()
         row = {"owner": owner, "boot": boot, "steady": steady, "now": self._now_ns()}
 
-        def work(c: apsw.Connection) -> None:
+        def work(c: SqlConnection) -> None:
             inbox.release(c, owner)
             uploads.release(c, owner)
             change(c, "forget_shards", {"boot": boot, "before": steady - SHARD_FORGOTTEN_NS})
@@ -328,18 +411,18 @@ class SqliteStore:
 
     def beat(self, owner: str, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """See `Store.beat`."""
-        row = {"owner": owner, "boot": clocks.boot_id(), "steady": self._steady_ns(), "now": self._now_ns()}
+        row = {"owner": owner, "boot": self._clock.name, "steady": self._steady_ns(), "now": self._now_ns()}
 
-        def work(c: apsw.Connection) -> list[bool]:
+        def work(c: SqlConnection) -> list[bool]:
             change(c, "beat", row)
             return inbox.renew(c, claims, lease_s, self._steady_ns())
 
-        return self._writer.run(work)
+        return self._writer.run(work, [("shard", owner), *inbox.locks_of(claims)])
 
     def leave(self, owner: str) -> None:
         """See `Store.leave`."""
 
-        def work(c: apsw.Connection) -> None:
+        def work(c: SqlConnection) -> None:
             inbox.release(c, owner)
             uploads.release(c, owner)
             change(c, "leave", {"owner": owner})
@@ -348,9 +431,9 @@ class SqliteStore:
 
     def shards(self) -> list[ShardSeen]:
         """See `Store.shards`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             rows = fetch(c, "shards")
-        steady, boot = self._steady_ns(), clocks.boot_id()
+        steady, boot = self._steady_ns(), self._clock.name
         return [
             ShardSeen(owner, since_ns, (steady - beat_ns) / NS_PER_S if of_boot == boot else None)
             for owner, of_boot, beat_ns, since_ns in rows
@@ -358,12 +441,12 @@ class SqliteStore:
 
     def dirty_count(self) -> int:
         """See `Store.dirty_count`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return int(fetch(c, "dirty_count")[0][0])
 
     def ready_in_s(self) -> float | None:
         """See `Store.ready_in_s`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             ready_ns: int | None = fetch(c, "next_ready")[0][0]
         return None if ready_ns is None else (ready_ns - self._steady_ns()) / NS_PER_S
 
@@ -383,7 +466,10 @@ class SqliteStore:
         """See `Store.load`."""
         with self._readers.snapshot() as c:
             head = versions.stored(c, "stored_head", claim.layer, claim.tile)
-            return TileWork(claim, head, self._in_play(c, claim.layer, claim.tile))
+            work = TileWork(claim, head, self._in_play(c, claim.layer, claim.tile))
+            check_signed(c, self.signing, work.epoch)
+        play = replace(work.journal, epoch=self._whole(work.journal.epoch))
+        return replace(work, head=self._whole(work.head), journal=play)
 
     def basis(self, layer: str, tile: TileId, version: int) -> Basis | None:
         """See `Store.basis`."""
@@ -402,17 +488,18 @@ class SqliteStore:
 
     def windows(self) -> list[WindowCounts]:
         """See `Store.windows`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return journal.windows(c)
 
     def publish(self, publications: Sequence[Publication]) -> list[PublishResult]:
         """See `Store.publish`."""
         if not publications:
             return []
-        pairs = [(one, None if one.tile is None else Content.of(one.tile)) for one in publications]
+        contents = self._kept([None if one.tile is None else Content.of(one.tile) for one in publications])
+        pairs = list(zip(publications, contents, strict=True))
 
-        def work(c: apsw.Connection) -> list[PublishResult]:
-            return [versions.publish(c, one, content, self.timing()) for one, content in pairs]
+        def work(c: SqlConnection) -> list[PublishResult]:
+            return [versions.publish(c, one, content, self.timing(), self.signing) for one, content in pairs]
 
         return self._writer.run(work)
 
@@ -425,55 +512,83 @@ class SqliteStore:
     ) -> list[PublishResult]:
         """See `Store.put_tiles`."""
         check_layer(layer)
-        pairs = [(tile.tile_id, _content(tile, layer)) for tile in tiles]
+        some = list(tiles)
+        contents = self._kept([_content(tile, layer) for tile in some])
+        pairs = [(tile.tile_id, one) for tile, one in zip(some, contents, strict=True) if one is not None]
 
-        def work(c: apsw.Connection) -> list[PublishResult]:
+        def work(c: SqlConnection) -> list[PublishResult]:
             now = self._now_ns()
-            return [versions.put_base(c, layer, tile, content, reason, now, surveyed_ns) for tile, content in pairs]
+            return [
+                versions.put_base(c, layer, tile, content, reason, now, surveyed_ns, signing=self.signing)
+                for tile, content in pairs
+            ]
 
         return self._writer.run(work)
 
-    def transact(self, work: Callable[[apsw.Connection, int], _T]) -> _T:
+    def transact(self, work: Callable[[SqlConnection, int], _T]) -> _T:
         """Run `work(connection, now)` in one durable write transaction: all that it writes, or nothing if it raises."""
         return self._writer.run(lambda c: work(c, self._now_ns()))
 
-    def look(self, work: Callable[[apsw.Connection], _T]) -> _T:
+    def look(self, work: Callable[[SqlConnection], _T]) -> _T:
         """Run `work(connection)` on the store as it is at one instant."""
         with self._readers.snapshot() as c:
             return work(c)
 
     def rollback(self, layer: str, tile: TileId, version: int) -> StoredTile:
         """See `Store.rollback`."""
-        return self._writer.run(lambda c: versions.rollback(c, layer, tile, version, self._now_ns()))
+        return self.whole(
+            self._writer.run(lambda c: versions.rollback(c, layer, tile, version, self._now_ns(), self.signing))
+        )
 
     def notices(self, older_than_s: float = 0.0, n: int = 1000) -> list[Notice]:
         """See `Store.notices`."""
         # All are all: the clock may have been set back since they were written.
         before = self._now_ns() - round(older_than_s * NS_PER_S) if older_than_s else 2**63 - 1
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             rows = fetch(c, "notices", {"before": before, "n": n})
             return [Notice(layer, TileId(tile), version) for layer, tile, version in rows]
 
     def announced(self, notices: Sequence[Notice]) -> None:
         """See `Store.announced`."""
         keys = [{"layer": one.layer, "tile": one.tile.morton, "version": one.version} for one in notices]
-        self._writer.run(lambda c: [change(c, "delete_notice", key) for key in keys])
+
+        def work(c: SqlConnection) -> None:
+            for key in keys:
+                c.post("delete_notice", key)
+
+        self._writer.run(work, inbox.locks_of(notices))
+
+    def check_signed(self, stored: StoredTile) -> None:
+        """See `Store.check_signed`."""
+        if self.signing is not None:
+            with self._readers.snapshot() as c:
+                check_signed(c, self.signing, stored)
+
+    def unsigned(self) -> int:
+        """See `Store.unsigned`."""
+        with self._readers.single() as c:
+            return int(fetch(c, "unsigned_heads")[0][0])
+
+    def publisher_chain(self, signer: bytes) -> bytes | None:
+        """See `Store.publisher_chain`."""
+        with self._readers.single() as c:
+            return chain_of(c, signer)
 
     # Confirmation
 
     def waiting_changes(self) -> list[WaitingChange]:
         """See `Store.waiting_changes`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return confirmation.waiting_changes(c)
 
     def shifted_vehicles(self) -> frozenset[str]:
         """See `Store.shifted_vehicles`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return accounts.shifted_vehicles(c)
 
     def quarantined_vehicles(self) -> frozenset[str]:
         """See `Store.quarantined_vehicles`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return frozenset(one.vehicle for one in trust.quarantined(c))
 
     def vehicle_trusts(self) -> list[VehicleTrust]:
@@ -489,6 +604,53 @@ class SqliteStore:
         """See `Store.release_vehicle`."""
         return self._writer.run(lambda c: trust.release(c, vehicle, self.timing()))
 
+    def marks_of_tile(self, layer: str, tile: TileId) -> frozenset[str]:
+        """See `Store.marks_of_tile`."""
+        with self._readers.snapshot() as c:
+            return standing.marks_of_tile(c, layer, tile)
+
+    def lone_words(self) -> list[LoneWord]:
+        """See `Store.lone_words`."""
+        with self._readers.snapshot() as c:
+            return standing.lone_words(c)
+
+    def impossible_places(self) -> list[ImpossibleSaid]:
+        """See `Store.impossible_places`."""
+        with self._readers.snapshot() as c:
+            return [ImpossibleSaid(*row) for row in c.fetch("impossible_places")]
+
+    def unheard_vehicles(self) -> dict[str, int]:
+        """See `Store.unheard_vehicles`."""
+        with self._readers.snapshot() as c:
+            return {vehicle: int(n) for vehicle, n in c.fetch("unheard_vehicles")}
+
+    def days_alone(self) -> list[DayAlone]:
+        """See `Store.days_alone`."""
+        with self._readers.snapshot() as c:
+            return [DayAlone(*row) for row in c.fetch("days_alone")]
+
+    def pairs_of_groups(self) -> list[VehiclePair]:
+        """See `Store.pairs_of_groups`."""
+        with self._readers.snapshot() as c:
+            return standing.pairs_of_groups(c)
+
+    def refuted_tests(self) -> list[tuple[str, TileId, str, str]]:
+        """See `Store.refuted_tests`."""
+        with self._readers.single() as c:
+            return trust.refuted_tests(c)
+
+    def note_owner(self, vehicle: str, owner: str, since_ns: int) -> None:
+        """See `Store.note_owner`."""
+        if not self._owners.is_news(vehicle, owner):
+            return
+        self._writer.run(lambda c: trust.note_owner(c, vehicle, owner, since_ns), [("owner", vehicle)])
+        self._owners.note(vehicle, owner)
+
+    def owners_of(self, vehicles: Iterable[str]) -> dict[str, tuple[tuple[int, str], ...]]:
+        """See `Store.owners_of`."""
+        with self._readers.single() as c:
+            return trust.owners_of(c, vehicles)
+
     def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
         """See `Store.refuted_reports`."""
         with self._readers.snapshot() as c:
@@ -501,7 +663,7 @@ class SqliteStore:
 
     def dirty_tiles(self) -> list[DirtyTile]:
         """See `Store.dirty_tiles`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             rows = fetch(c, "dirty_tiles")
         return [DirtyTile(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
 
@@ -514,7 +676,7 @@ class SqliteStore:
 
     def doubted_vehicles(self, layer: str, tile: TileId) -> frozenset[str]:
         """See `Store.doubted_vehicles`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return trials.doubted_vehicles(c, layer, tile)
 
     # Reading
@@ -523,40 +685,43 @@ class SqliteStore:
         """See `Store.get`."""
         if version is not None and at_ns is not None:
             raise StoreError(f"get {tile.path}: give a version ({version}) or a time ({at_ns}), not both")
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             if version is not None:
-                return versions.stored(c, "stored_version", layer, tile, version=version)
-            if at_ns is not None:
-                return versions.stored(c, "stored_at", layer, tile, at_ns=at_ns)
-            return versions.stored(c, "stored_head", layer, tile)
+                found = versions.stored(c, "stored_version", layer, tile, version=version)
+            elif at_ns is not None:
+                found = versions.stored(c, "stored_at", layer, tile, at_ns=at_ns)
+            else:
+                found = versions.stored(c, "stored_head", layer, tile)
+        return self._whole(found)
 
     def by_sha(self, layer: str, tile: TileId, sha: bytes) -> StoredTile | None:
         """See `Store.by_sha`."""
-        with self._readers.snapshot() as c:
-            return versions.stored(c, "stored_by_sha", layer, tile, sha=sha)
+        with self._readers.single() as c:
+            found = versions.stored(c, "stored_by_sha", layer, tile, sha=sha)
+        return self._whole(found)
 
     def layers(self) -> list[str]:
         """See `Store.layers`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return [layer for (layer,) in fetch(c, "layers")]
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """See `Store.heads`."""
         first, end = morton_range(prefix)
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             rows = fetch(c, "heads", {"layer": layer, "first": first, "end": end})
         return [CatalogEntry(TileId(tile), version, sha) for tile, version, sha in rows]
 
     def head_lines(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[HeadLine]:
         """See `Store.head_lines`."""
         first, end = morton_range(prefix)
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             rows = fetch(c, "head_lines", {"layer": layer, "first": first, "end": end})
         return [HeadLine(TileId(tile), *rest) for tile, *rest in rows]
 
     def history(self, layer: str, tile: TileId) -> list[VersionInfo]:
         """See `Store.history`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return [VersionInfo(*row) for row in fetch(c, "history", {"layer": layer, "tile": tile.morton})]
 
     def provenance(self, layer: str, tile: TileId, version: int) -> tuple[str, ...]:
@@ -569,7 +734,7 @@ class SqliteStore:
 
     def _provenance(self, layer: str, tile: TileId, version: int) -> Provenance:
         place = {"layer": layer, "tile": tile.morton, "version": version}
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             rows = fetch(c, "provenance", place)
         if not rows:
             raise UnknownVersion(f"tile {tile.path} of layer {layer} has no version {version}")
@@ -577,7 +742,7 @@ class SqliteStore:
 
     def counts(self) -> StoreCounts:
         """See `Store.counts`."""
-        with self._readers.snapshot() as c:
+        with self._readers.single() as c:
             return StoreCounts(*fetch(c, "counts")[0])
 
     # Upkeep
@@ -588,11 +753,72 @@ class SqliteStore:
             raise StoreError(f"keep_versions is {keep_versions}; at least the newest version stays")
         return self._writer.run(lambda c: versions.collect(c, keep_versions))
 
-    def backup(self, path: str | Path) -> None:
-        """See `Store.backup`."""
-        copy_store(self.path, Path(path))
-
 
 def _content(tile: AnyTile, layer: str) -> Content:
     check_fits(tile, layer)
     return Content.of(tile)
+
+
+@dataclass(frozen=True, slots=True)
+class _SteppedClock:
+    """A clock of a queue that reads what it is told to."""
+
+    name: str
+    read_ns: Callable[[], int]
+
+    def steady_ns(self) -> int:
+        return self.read_ns()
+
+
+class SqliteStore(SqlStore):
+    """`Store` in an SQLite file: one writer that groups commits, read-only connections for readers.
+
+    Args:
+        path: the file; with `create` it is made when missing (its folder must exist).
+        config: batching and waiting of this process.
+        signing: who signs what is published, and checks what is built upon; None: nobody does.
+        read_only: nothing is written, also not beside the file; whatever would write is StoreUnavailable.
+        now_ns: the time of day, int ns UTC; it may step.
+        steady_ns: the clock of the queue, ns; it never steps, and is the same in all processes of the machine.
+
+    Raises:
+        StoreUnavailable: no such file or folder, no permission, not a store, written by a newer release.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        config: StoreConfig | None = None,
+        *,
+        create: bool = True,
+        signing: Signing | None = None,
+        read_only: bool = False,
+        now_ns: Callable[[], int] = clocks.day_ns,
+        steady_ns: Callable[[], int] = clocks.steady_ns,
+    ) -> None:
+        self.path = Path(path)
+        readers = ReaderPool(self.path)
+        clock = _SteppedClock(clocks.boot_id(), steady_ns)
+        if read_only:
+            require_current(self.path)
+            super().__init__(str(path), readers, NoWriter(self.path), config, signing, now_ns, clock, clocks.MACHINE)
+        else:
+            connection = open_writer(self.path, create=create, busy_timeout_s=BUSY_TIMEOUT_S)
+            writer = SqliteWriter(connection, group_max=GROUP_MAX)
+            super().__init__(str(path), readers, writer, config, signing, now_ns, clock, clocks.MACHINE)
+            self._enter_boot()
+
+    def backup(self, path: str | Path) -> None:
+        """See `Store.backup`."""
+        copy_store(self.path, Path(path))
+
+    def sizes(self) -> dict[str, int]:
+        """Of the file ("store") and of its log."""
+        return {name: _size(Path(f"{self.path}{suffix}")) for name, suffix in (("store", ""), ("-wal", "-wal"))}
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0

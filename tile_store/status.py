@@ -6,7 +6,6 @@ from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from math import degrees
-from pathlib import Path
 from typing import Any, Final
 
 import click
@@ -15,6 +14,7 @@ from rich.table import Table
 
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.errors import SchemaError
+from gnd.tile_store.location import LOCATION, StoreLocation, shown
 from gnd.tile_store.options import json_option, show, to_read
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import VehicleAccount, WaitingChange, WaitingReason
@@ -28,7 +28,8 @@ WORDS: Final[dict[WaitingReason, str]] = {
     "named": "its reports are shifted again and again",
     "parked": "the shape of a vehicle, and has not stood for long",
     "season": "leaves of a tree that stayed",
-    "contradicted": "others contradict most of what it claims there",
+    "contradicted": "others contradict most of what it claims, there or elsewhere",
+    "day": "it has changed as much alone on that day as one vehicle may",
     "quarantined": "its reports do not count (`gnd vehicles why`)",
 }
 
@@ -37,15 +38,15 @@ DOUBTED: Final = ("doubtful", "shift")
 
 
 @click.command(short_help="What the map waits for: confirmation, merging, people.")
-@click.argument("path", metavar="STORE", type=click.Path(path_type=Path))
+@click.argument("path", metavar="STORE", type=LOCATION)
 @json_option
-def status(path: Path, as_json: bool) -> None:
+def status(path: StoreLocation, as_json: bool) -> None:
     """How STORE stands: its shards and its queue, tiles set aside, unconfirmed changes, vehicles to be checked, refused
     messages.
     """
     with to_read(path) as store:
         values = status_of(store)
-    show(values, as_json, lambda console: print_status(console, str(path), values))
+    show(values, as_json, lambda console: print_status(console, shown(path), values))
 
 
 def status_of(store: Store) -> dict[str, Any]:

@@ -15,10 +15,13 @@ from gnd.tile_store.values import (
     Basis,
     Claim,
     ClosedWindow,
+    DayAlone,
     DirtyTile,
     GcResult,
     HeadLine,
+    ImpossibleSaid,
     JournalMark,
+    LoneWord,
     Notice,
     Publication,
     PublishResult,
@@ -33,6 +36,7 @@ from gnd.tile_store.values import (
     TileSetAside,
     TileWork,
     VehicleAccount,
+    VehiclePair,
     VehicleTrust,
     VersionInfo,
     VersionKind,
@@ -50,15 +54,17 @@ class Store(Protocol):
 
     # Uploads
 
-    def put_upload(self, upload: Upload, home: str) -> PutStatus:
-        """Keep a message as it came, received by shard `home`; the same bytes on the same key are a "duplicate"."""
+    def put_upload(self, upload: Upload, home: str, patient_s: float = 0.0) -> PutStatus:
+        """Keep a message as it came, received by shard `home`; the same bytes on the same key are a "duplicate". It may
+        wait so long for a commit that others cause.
+        """
 
     def claim_uploads(
         self, owner: str, n: int, lease_s: float, in_turn: Callable[[list[str]], list[str]] = sorted
     ) -> list[UploadClaim]:
         """Lease up to `n` uploads that wait: of the vehicles in the order into which `in_turn` brings them ("":
-        Gaussians, which do not tell whose they are), a few of each, its oldest first; one that was claimed before comes
-        alone.
+        Gaussians, which do not tell whose they are), a few of each, its oldest first; of those that it leaves out
+        none. One that was claimed before comes alone.
         """
 
     def uploads_waiting(self, vehicle: str | None, at_most: int) -> int:
@@ -230,6 +236,21 @@ class Store(Protocol):
     def announced(self, notices: Sequence[Notice]) -> None:
         """Confirm that the update notices of these versions have gone out."""
 
+    def check_signed(self, stored: StoredTile) -> None:
+        """Whether one of our publishers answers for a version; a process without an identity takes what is there.
+
+        Raises:
+            StoreDamaged: nobody does.
+        """
+
+    def unsigned(self) -> int:
+        """How many of the newest versions nobody has signed."""
+
+    def publisher_chain(self, signer: bytes) -> bytes | None:
+        """The certificates of somebody who has signed versions, by id (8 bytes): each as DER with its length (2 bytes)
+        before it; None: nobody of that id has.
+        """
+
     # Confirmation
 
     def waiting_changes(self) -> list[WaitingChange]:
@@ -253,6 +274,36 @@ class Store(Protocol):
 
     def release_vehicle(self, vehicle: str) -> bool:
         """Let a vehicle's reports count again, and pardon what was held against it; False: it was not quarantined."""
+
+    def marks_of_tile(self, layer: str, tile: TileId) -> frozenset[str]:
+        """Words (`marks`) about the vehicles that have reported about a tile and are not believed alone, or have one
+        vote with others. When one comes or goes, the tiles in whose open windows its vehicle has spoken wait to be
+        merged again.
+        """
+
+    def lone_words(self) -> list[LoneWord]:
+        """Who is not believed alone, on which day or in general, and why; of all vehicles of an owner as `@DIGEST`."""
+
+    def impossible_places(self) -> list[ImpossibleSaid]:
+        """Vehicles of which reports were refused because they cannot have been there, by vehicle."""
+
+    def unheard_vehicles(self) -> dict[str, int]:
+        """Vehicles of which statements of some kind do not count somewhere, and in how many windows of tiles."""
+
+    def days_alone(self) -> list[DayAlone]:
+        """What each vehicle has changed alone and with others on each day, by vehicle and day."""
+
+    def pairs_of_groups(self) -> list[VehiclePair]:
+        """Vehicles two by two that say the same false things, by name."""
+
+    def refuted_tests(self) -> list[tuple[str, TileId, str, str]]:
+        """The newest reports that others contradict as a whole: layer, tile, report id, vehicle; the newest first."""
+
+    def note_owner(self, vehicle: str, owner: str, since_ns: int) -> None:
+        """Whose a vehicle is from then on, as its certificate says; it stands in the store before its report does."""
+
+    def owners_of(self, vehicles: Iterable[str]) -> dict[str, tuple[tuple[int, str], ...]]:
+        """Of those vehicles whose owner is known: since when, UTC ns, and a digest of the owner's name; ascending."""
 
     def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
         """The reports of some vehicles about a layer that others contradict in most tiles, and whose each is. When one

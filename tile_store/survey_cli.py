@@ -2,25 +2,25 @@
 
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 from rich.table import Table
 
-from gnd.tile_store import clocks, sqlite_roads
-from gnd.tile_store.options import PATH, json_option, layer_option, show, to_read
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store import clocks, sql_roads
+from gnd.tile_store.location import LOCATION, StoreLocation, shown
+from gnd.tile_store.options import json_option, layer_option, show, to_read
+from gnd.tile_store.sqlite_store import SqlStore
 
 _DAY_NS = 86_400 * 10**9
 
 
 @click.command(short_help="New roads that vehicles have surveyed: drafts, what waits, what is published.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @layer_option
 @json_option
-def survey(path: Path, layer: str, as_json: bool) -> None:
+def survey(path: StoreLocation, layer: str, as_json: bool) -> None:
     """The tiles of STORE that vehicles have surveyed where the map had no road.
 
     A tile is a draft until two vehicles have driven there, waits while they disagree or its place is not known well
@@ -29,19 +29,19 @@ def survey(path: Path, layer: str, as_json: bool) -> None:
     """
     with to_read(path) as store:
         values = survey_of_store(store, layer, clocks.day_ns())
-    show(values, as_json, lambda console: print_survey(console, str(path), values))
+    show(values, as_json, lambda console: print_survey(console, shown(path), values))
 
 
-def survey_of_store(store: SqliteStore, layer: str, now_ns: int) -> dict[str, Any]:
+def survey_of_store(store: SqlStore, layer: str, now_ns: int) -> dict[str, Any]:
     """What surveys have made of a layer, in plain values."""
-    tiles = store.look(lambda c: sqlite_roads.tiles(c, layer))
+    tiles = store.look(lambda c: sql_roads.tiles(c, layer))
     rows = [
         {name: value for name, value in asdict(one).items() if name not in ("codec_id", "body", "layer")}
         | {"tile": one.tile.path, "bytes": len(one.body), "age_days": round((now_ns - one.last_ns) / _DAY_NS, 2)}
         for one in tiles
     ]
     counts = {state: sum(one.state == state for one in tiles) for state in ("draft", "waiting", "published")}
-    open_parts = sum(one.parts for one in store.look(sqlite_roads.open_roads) if one.layer == layer)
+    open_parts = sum(one.parts for one in store.look(sql_roads.open_roads) if one.layer == layer)
     return {"layer": layer, **counts, "parts_not_mapped": open_parts, "tiles": rows}
 
 

@@ -7,28 +7,30 @@ from typing import Any, Final
 import click
 from rich.console import Console
 
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.tile_store import tables
 from gnd.tile_store.arguments import parse_place, parse_tile, parse_time_ns
 from gnd.tile_store.backup import copy_store
-from gnd.tile_store.check import check_store
+from gnd.tile_store.check import check_rows, check_store
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.options import PATH, bars, existing, json_option, layer_option, show, to_read
+from gnd.tile_store.location import LOCATION, StoreLocation, file_of, required_file, shown
+from gnd.tile_store.options import PATH, bars, existing, json_option, layer_option, show, to_publish, to_read
 from gnd.tile_store.retention import retain
 from gnd.tile_store.rollback import MEANING, RollbackStep, RollbackTarget, plan, roll_back
 
-STORE: Final = click.argument("path", metavar="STORE", type=PATH)
+STORE: Final = click.argument("path", metavar="STORE", type=LOCATION)
 
 
 @click.command(short_help="Copy a map that is in use.")
 @STORE
 @click.argument("target", metavar="FILE", type=PATH)
 @json_option
-def backup(path: Path, target: Path, as_json: bool) -> None:
+def backup(path: StoreLocation, target: Path, as_json: bool) -> None:
     """Copy STORE to FILE as it is at one instant, and compare every tile of the copy with its hash.
 
     The cloud may be running. FILE must not exist; it is one file, which `gnd map restore` makes a store again.
     """
-    _copied(path, target, "backed up", as_json)
+    _copied(required_file(path, "gnd map backup"), target, "backed up", as_json)
 
 
 @click.command(short_help="Make a store of a backup.")
@@ -61,14 +63,20 @@ def _copied(source: Path, target: Path, done: str, as_json: bool) -> None:
 @click.option("--all-versions", is_flag=True, help="Older versions, too.")
 @json_option
 @click.pass_context
-def check(context: click.Context, path: Path, all_versions: bool, as_json: bool) -> None:
+def check(context: click.Context, path: StoreLocation, all_versions: bool, as_json: bool) -> None:
     """Read every page, tile and report of STORE, and compare tiles with their hashes; exit code 1 if one is damaged."""
     with bars() as progress:
-        checked = check_store(path, all_versions=all_versions, progress=progress)
+        file = file_of(path)
+        if file is None:
+            with to_read(path) as opened:
+                checked = opened.look(lambda c: check_rows(c, path, all_versions=all_versions, progress=progress))
+        else:
+            checked = check_store(file, all_versions=all_versions, progress=progress)
     values = checked.as_dict()
-    line = f"{path}: whole; {checked.tiles} tiles and {checked.reports} report parts read, schema {checked.schema}"
+    line = f"{shown(path)}: whole; {checked.tiles} tiles and {checked.reports} report parts read"
+    line += f", schema {checked.schema}"
     if checked.damages:
-        show(values, as_json, lambda console: console.print(tables.checked(str(path), values)))
+        show(values, as_json, lambda console: console.print(tables.checked(shown(path), values)))
         context.exit(1)
     show(values, as_json, lambda console: console.print(line, highlight=False, soft_wrap=True))
 
@@ -83,7 +91,7 @@ def check(context: click.Context, path: Path, all_versions: bool, as_json: bool)
 @click.option("--quarantine-mb", type=click.FloatRange(0.0), help="So much of the newest refused messages stays.")
 @json_option
 def gc(
-    path: Path,
+    path: StoreLocation,
     keep_versions: int | None,
     keep_days: float | None,
     folded: bool,
@@ -101,8 +109,8 @@ def gc(
     with existing(path) as opened:
         removed = retain(opened, keep_versions, keep_days, quarantine_mb, folded=folded)
     line = (
-        f"{path}: {removed.versions} versions removed, {removed.version_bytes / 1e6:.2f} MB; {removed.reports} report"
-        f" parts, {removed.report_bytes / 1e6:.2f} MB; {removed.quarantined} refused messages,"
+        f"{shown(path)}: {removed.versions} versions removed, {removed.version_bytes / 1e6:.2f} MB; {removed.reports}"
+        f" report parts, {removed.report_bytes / 1e6:.2f} MB; {removed.quarantined} refused messages,"
         f" {removed.quarantined_bytes / 1e6:.2f} MB; {removed.uploads} settled uploads"
     )
     show(asdict(removed), as_json, lambda console: console.print(line, highlight=False, soft_wrap=True))
@@ -113,7 +121,7 @@ def gc(
 @click.argument("tiles", metavar="[TILE]...", nargs=-1)
 @layer_option
 @json_option
-def retry(path: Path, tiles: tuple[str, ...], layer: str, as_json: bool) -> None:
+def retry(path: StoreLocation, tiles: tuple[str, ...], layer: str, as_json: bool) -> None:
     """Have the tiles merged again that were set aside, or only each TILE of a layer (see `gnd map status`)."""
     wanted = [(layer, parse_tile(text)) for text in tiles]
     with existing(path) as opened:
@@ -123,7 +131,7 @@ def retry(path: Path, tiles: tuple[str, ...], layer: str, as_json: bool) -> None
                 f"tile {tile.path} of layer {layer} is not set aside; `gnd map status` lists those that are"
             )
         n = opened.take_up_again(wanted or sorted(aside, key=lambda one: (one[0], one[1].morton)))
-    line = f"{path}: {n} tiles wait to be merged again" if n else f"{path}: no tile is set aside"
+    line = f"{shown(path)}: {n} tiles wait to be merged again" if n else f"{shown(path)}: no tile is set aside"
     show({"tiles": n}, as_json, lambda console: console.print(line, highlight=False, soft_wrap=True))
 
 
@@ -135,8 +143,9 @@ def retry(path: Path, tiles: tuple[str, ...], layer: str, as_json: bool) -> None
 @click.option("--dry-run", is_flag=True, help="Only say what would change.")
 @layer_option
 @json_option
+@identity_option
 def rollback(
-    path: Path, place: str, version: int | None, to: str | None, dry_run: bool, layer: str, as_json: bool
+    path: StoreLocation, place: str, version: int | None, to: str | None, dry_run: bool, layer: str, as_json: bool
 ) -> None:
     """Publish older content of a TILE as its next version; merged reports count no more.
 
@@ -147,12 +156,13 @@ def rollback(
     if (version is None) == (to is None):
         raise StoreError("rollback: give --to VERSION or --to TIME")
     region, target = parse_place(place), _target(str(version) if to is None else to)
-    with to_read(path) if dry_run else existing(path) as opened:
+    with to_read(path) if dry_run else to_publish(path) as opened:
         steps = (plan if dry_run else roll_back)(opened, layer, region, target)
         after = {head.tile: head.version for head in opened.heads(layer)}
     rows = [_step(one, after[one.tile]) for one in steps]
     n = sum(one.action in ("rollback", "empty") for one in steps)
-    title = f"{path}, layer {layer}: {n} of {len(steps)} tiles {'would change' if dry_run else 'have changed'}"
+    verb = "would change" if dry_run else "have changed"
+    title = f"{shown(path)}, layer {layer}: {n} of {len(steps)} tiles {verb}"
     values = {"layer": layer, "dry_run": dry_run, "tiles": rows}
 
     def print_it(console: Console) -> None:

@@ -5,6 +5,7 @@ from typing import Final, Literal
 
 from gnd.schemas.report_id import check_report_id
 from gnd.tile_store.errors import StoreError
+from gnd.tile_store.places import ReportPlace
 from gnd.tile_store.values import ReportRow
 
 UploadForm = Literal["packed", "gaussians", "whole", "features"]
@@ -85,6 +86,8 @@ class Settled:
         wanted: state "wanted": the mask.
         reason: state "resend" or "quarantined": why.
         first: of Gaussians: the flags that they answer.
+        place: where its vehicle was, by the rows.
+        is_impossible: it is refused because its vehicle cannot have been there.
     """
 
     claim: UploadClaim
@@ -93,6 +96,8 @@ class Settled:
     wanted: bytes = b""
     reason: str = ""
     first: Answered | None = None
+    place: ReportPlace | None = None
+    is_impossible: bool = False
 
 
 @dataclass(frozen=True, slots=True)

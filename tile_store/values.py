@@ -15,6 +15,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.limits import MAX_TILE_BODY_BYTES
 from gnd.schemas.report_id import check_report_id
 from gnd.schemas.tiles import TileBlob, content_of, features_of, tile_of
+from gnd.schemas.version_signature import VersionSignature, VersionStatement
 from gnd.schemas.wire import LAYER_PATTERN
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.trials import TrialTerms
@@ -23,7 +24,7 @@ VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
 WaitingReason = Literal[
-    "share", "isolated", "poses", "doubtful", "shift", "named", "parked", "season", "contradicted", "quarantined"
+    "share", "isolated", "poses", "doubtful", "shift", "named", "parked", "season", "contradicted", "day", "quarantined"
 ]
 QUARANTINED: Final = "!"
 """Before the name of a vehicle among those named: its reports do not count at all."""
@@ -35,6 +36,7 @@ def counted_out(named: frozenset[str]) -> frozenset[str]:
 
 
 SHA_BYTES: Final = 32
+NS_PER_S: Final = 1_000_000_000
 DEFAULT_LAYER: Final = "ndt"
 DEFAULT_CODEC: Final = "standard"
 MAP_CODECS: Final = (*LATTICES, "float")
@@ -75,11 +77,16 @@ REFUTED_SHARE: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """A tile's content as a store keeps it: hash, codec and encoded bytes."""
+    """A tile's content as a store keeps it: hash, codec and encoded bytes.
+
+    `kept_s` is when, by `time.monotonic`, its body was about to be put among the objects of the store; None: it is not
+    there. An empty body lies there already, named by another version.
+    """
 
     sha: bytes
     codec_id: int
     body: bytes = field(repr=False)
+    kept_s: float | None = None
 
     @classmethod
     def of(cls, tile: AnyTile) -> "Content":
@@ -183,15 +190,22 @@ class StoredTile:
     body: bytes = field(repr=False)
     surveyed_ns: int | None = None
     """When the world was measured of which a base was built; None: not told, or no base."""
+    signature: VersionSignature | None = field(default=None, repr=False)
+    """Of who answers for it; None: nobody does."""
+
+    @property
+    def statement(self) -> VersionStatement:
+        """What its publisher signs."""
+        return VersionStatement(
+            self.layer, self.tile, self.version, self.sha, self.kind, self.day, self.created_ns // NS_PER_S
+        )
 
     @property
     def day(self) -> int:
         """When the world looked so: of a merge the day of its publication, of a base that of its survey. What is
         published again is as old as it was, which nobody has written down.
         """
-        if self.kind == "merged":
-            return day_of(self.created_ns)
-        return UNKNOWN_DAY if self.surveyed_ns is None else day_of(self.surveyed_ns)
+        return day_of_version(self.kind, self.created_ns, self.surveyed_ns)
 
     def to_blob(self) -> TileBlob:
         """What goes out on the bus."""
@@ -208,6 +222,13 @@ class StoredTile:
     def decode_features(self) -> FeatureTile:
         """As `decode`, of a feature layer; BadValue when it holds Gaussians."""
         return features_of(self.to_blob())
+
+
+def day_of_version(kind: VersionKind, created_ns: int, surveyed_ns: int | None) -> int:
+    """As `StoredTile.day`, of a version that does not lie in the store yet."""
+    if kind == "merged":
+        return day_of(created_ns)
+    return UNKNOWN_DAY if surveyed_ns is None else day_of(surveyed_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -441,7 +462,8 @@ class Unconfirmed:
             reports with poor poses only; "doubtful": the vehicle doubts it itself; "shift": a shift of its poses
             explains it; "named": its reports are shifted again and again; "parked": it has the shape of a vehicle
             and has not stood for long, whoever saw it; "season": it came or went in the crown of a tree that stayed;
-            "contradicted": others contradict most of what the vehicle claims there;
+            "contradicted": others contradict most of what the vehicle claims there, or in other tiles;
+            "day": it has changed as much alone on that day as one vehicle may;
             "quarantined": of a vehicle whose reports do not count.
     """
 
@@ -500,6 +522,97 @@ class AgreementTest:
     quotes: int
     refuted_quotes: int
     is_refuted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleStanding:
+    """How a vehicle stands in one window of a tile, by that window's reports.
+
+    Attributes:
+        vehicle: its pseudonym.
+        window: of the tile's journal.
+        at_ns: time of the last scan of its newest report there, UTC.
+        day: when that report was received, in days since 1970.
+        alone: voxels that are changed on its word alone, whether or not it has changed too much alone on that day.
+        shared: voxels that are changed on its word and that of others.
+        judged: changes that it claims and somebody else has seen, too, ...
+        denied: ... of which so many are denied by more than say the same.
+        unheard: of so many kinds its statements do not count there.
+    """
+
+    vehicle: str
+    window: int
+    at_ns: int
+    day: int
+    alone: int
+    shared: int
+    judged: int
+    denied: int
+    unheard: int
+
+
+@dataclass(frozen=True, slots=True)
+class Coincidence:
+    """How far what two vehicles claim coincides in a tile in which others contradict both as a whole.
+
+    Attributes:
+        one: the vehicle that comes first by name.
+        other: the other.
+        shared: voxels of which both claim the same.
+        by_chance: how many would coincide by chance.
+        least: claims of who claims less.
+    """
+
+    one: str
+    other: str
+    shared: int
+    by_chance: float
+    least: int
+
+
+@dataclass(frozen=True, slots=True)
+class LoneWord:
+    """A vehicle that is not believed alone, on a day (days since 1970) or in general (0), since when, UTC, and why."""
+
+    vehicle: str
+    day: int
+    since_ns: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class DayAlone:
+    """Voxels that were changed on a vehicle's word alone, and on its word and that of others, on a day (since 1970)."""
+
+    vehicle: str
+    day: int
+    alone: int
+    shared: int
+
+
+@dataclass(frozen=True, slots=True)
+class ImpossibleSaid:
+    """So many reports of a vehicle were refused because it cannot have been there: the first and the last time, UTC,
+    and why, the last time.
+    """
+
+    vehicle: str
+    times: int
+    since_ns: int
+    at_ns: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class VehiclePair:
+    """Two vehicles, by name, that say the same false things: voxels of which both claim the same, and how many would be
+    by chance.
+    """
+
+    one: str
+    other: str
+    shared: int
+    by_chance: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -608,8 +721,9 @@ class Publication:
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
     each changed feature, when known. `waiting` is what the reports claim and the content has not; None: as before.
     `shift_tests`, `agreement_tests` and `courses` are those of this tile's reports, which add to the accounts of their
-    vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have come to,
-    where any was folded. `trial`: who gets the version first; None: it is everybody's at once.
+    vehicles, as `standings` and `coincidences` do. `basis` says what of the journal the content was made of, `memory`
+    what the windows `closed` have come to, where any was folded. `trial`: who gets the version first; None: it is
+    everybody's at once.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -623,6 +737,8 @@ class Publication:
     shift_tests: tuple[ShiftTest, ...] = ()
     agreement_tests: tuple[AgreementTest, ...] = ()
     courses: tuple[CourseSaid, ...] = ()
+    standings: tuple[VehicleStanding, ...] = ()
+    coincidences: tuple[Coincidence, ...] = ()
     basis: Basis | None = None
     memory: StoredMemory | None = None
     closed: tuple[int, ...] = ()

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 )
 @click.option("--vehicle", help="Pseudonym of the vehicle.  [default: vehicle]")
 @click.option("--connect", multiple=True, help=f"Router; repeatable.  [default: {DEFAULT_ENDPOINT}]")
+@click.option("--tiles-from", help="URL of an archive (gnd map publish): tiles come from there, news over the bus.")
 @click.option("--link", help="Mobile link to feel: 3g, 4g, 5g, none or a TOML file.  [default: none]")
 @click.option("--work-dir", type=click.Path(path_type=Path), help="Cache, outbox and result.  [default: runs/VEHICLE]")
 @click.option("--pace", type=float, help="1 = real time, 0 = as fast as possible.  [default: 0]")

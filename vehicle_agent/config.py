@@ -182,6 +182,9 @@ class AgentConfig:
     drive: Path | None = setting(..., "Recording (MCAP) to drive; none where the vehicle drives now.")
     work_dir: Path = setting(..., "Folder of cache, outbox and result.")
     connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers, tried in order.")
+    tiles_from: str = setting(
+        "", "Archive on a web server (`gnd map publish`) that brings tiles first; the bus adds what is newer."
+    )
     link: str | LinkProfile = setting("none", "Mobile link to feel: 3g, 4g, 5g, none or a TOML file.")
     layer: str = setting("ndt", "Layer of the voxel map.")
     pace: float = setting(

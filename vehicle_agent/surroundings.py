@@ -25,7 +25,11 @@ STEP_M = 5.0  # the wanted tiles are looked at again after this much way
 AHEAD_S = 15.0  # tiles are asked for so long in advance, and at least `ahead_m`; longer than `LEAD_S`
 HELD_AHEAD_M: Final = 400.0
 """Where the cache holds this share of what is farther ahead, whether that still holds is asked with the next question:
-one of its own costs 330 B with its answer, another tile in it some 3."""
+one of its own costs 400 B with its answer, another tile in it some 1."""
+HELD_AROUND_M: Final = 1000.0
+"""And so are those that the cache holds of the districts of the plan: they do not change with every degree of the
+heading, as what lies straight ahead does."""
+MOST_AROUND: Final = 256
 KNOWN_SHARE: Final = 0.25
 BEYOND_STEP_M: Final = 60.0
 LINK_SHARE = 0.8  # part of the link's rate that the plan counts on
@@ -53,6 +57,7 @@ class Surroundings:
         self._rate_byte_s = LINK_SHARE * fetcher.link.rate_byte_s("down")
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
+        self._here: F64 | None = None
         self._asked: set[TileId] = set()  # with the last question, and not let go since
         self._beyond: tuple[TileId, ...] = ()  # farther ahead than the plan
         self._looked_beyond: F64 | None = None
@@ -114,6 +119,7 @@ class Surroundings:
 
     def _look(self, place: Place) -> None:
         p, here, frame = self._parameters, place.position_map_m, self._map.grid_frame.frame
+        self._here = here
         floor = int(np.floor(place.height_m / FLOORS_BELOW)) * FLOORS_BELOW
         self._map.cover_floors(floor - FLOORS_BELOW, floor + FLOORS_ABOVE)
         self.wanted = tiles_along(frame, place.ahead_map_m(self._ahead_m(place)), p.near_m)
@@ -143,7 +149,7 @@ class Surroundings:
         plan = self._plan if patiently else self._in_time()
         lead_s = LEAD_S + self._download_s(plan)
         if any(need.from_s <= lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
-            self._asked = {need.tile_id for need in plan} | self._known_beyond()
+            self._asked = {need.tile_id for need in plan} | self._known_beyond() | self._still_around()
         first = [need.tile_id for need in plan if need.tile_id in self._asked]
         self._fetcher.want([*first, *sorted(self._asked.difference(first))])
 
@@ -153,7 +159,24 @@ class Surroundings:
         """
         beyond = set(self._beyond).difference(self.wanted)
         held = sum(map(self._fetcher.is_held, beyond))
-        return beyond if held >= KNOWN_SHARE * len(beyond) else set()
+        return beyond | self._held_around() if held >= KNOWN_SHARE * len(beyond) else set()
+
+    def _still_around(self) -> set[TileId]:
+        """Those of the tiles asked for before that are not far away: who forgets them asks again."""
+        asked = sorted(self._asked)
+        if not asked or self._here is None:
+            return set()
+        away_m = TileRectangles.of(self._map.grid_frame.frame, asked).distances_m(self._here)
+        return {asked[n] for n in np.flatnonzero(away_m <= HELD_AROUND_M)}
+
+    def _held_around(self) -> set[TileId]:
+        """The nearest tiles that the cache holds of the plan's districts."""
+        held = self._fetcher.held_of({tile.district for tile in self.wanted})
+        if not held or self._here is None:
+            return set()
+        away_m = TileRectangles.of(self._map.grid_frame.frame, held).distances_m(self._here)
+        nearest = np.argsort(away_m, kind="stable")[:MOST_AROUND]
+        return {held[n] for n in nearest if away_m[n] <= HELD_AROUND_M}
 
     def _in_time(self) -> list[Need]:
         if math.isinf(self._rate_byte_s):

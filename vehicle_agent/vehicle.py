@@ -185,9 +185,11 @@ class AgentVehicle:
 
     def _link_counts(self) -> dict[str, Any]:
         reports, fetched, updates = self.link.outbox.counts(), self.link.fetcher.counts, self.bus.updates
+        check = self.link.fetcher.check
         return {
             "tiles_downloaded": fetched["blob"],
             "tiles": dict(fetched),
+            "versions_checked": {} if check is None else dict(check.counts),
             "feature_tiles": {} if self.bus.features is None else dict(self.bus.features.counts),
             "updates_received": updates["received"],
             "updates": dict(updates),

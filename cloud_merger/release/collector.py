@@ -6,17 +6,16 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable
 from typing import Final
 
-import apsw
-
 from gnd.fleet_bus.bus import Bus
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.health import HealthReport, TileHealth
 from gnd.schemas.keys import health_keys, parse_health_key
 from gnd.schemas.ticket import ticket_of
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
+from gnd.tile_store.connection import SqlConnection
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.sqlite_versions import sha_of
+from gnd.tile_store.sql_versions import sha_of
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.trials import Arm, VehicleHealth, VersionTrial
 
 _LOG: Final = logging.getLogger(__name__)
@@ -44,7 +43,7 @@ class HealthCollector:
             "flooding".
     """
 
-    def __init__(self, store: SqliteStore, clock_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, store: SqlStore, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._store, self._clock_s = store, clock_s
         self._free_s: OrderedDict[str, float] = OrderedDict()
         self.counts: Counter[str] = Counter()
@@ -85,7 +84,7 @@ class HealthCollector:
             self._free_s.popitem(last=False)
         return is_over
 
-    def _put(self, c: apsw.Connection, vehicle: str, report: HealthReport, now: int) -> Counter[str]:
+    def _put(self, c: SqlConnection, vehicle: str, report: HealthReport, now: int) -> Counter[str]:
         open_trials = trials.open_trials(c, report.layer, report.district.path)
         counts: Counter[str] = Counter()
         for told in report.tiles:
@@ -100,14 +99,14 @@ class HealthCollector:
         return counts
 
     @staticmethod
-    def _is_known(c: apsw.Connection, vehicle: str, report: HealthReport) -> bool:
+    def _is_known(c: SqlConnection, vehicle: str, report: HealthReport) -> bool:
         """Whether the store holds this message already, or a later one: nothing is to be written then."""
         open_trials = trials.open_trials(c, report.layer, report.district.path)
         told = [open_trials[one.tile] for one in report.tiles if one.tile in open_trials]
         return bool(told) and all(trials.told_ns(c, trial, vehicle) >= report.t_ns for trial in told)
 
 
-def _arm(c: apsw.Connection, trial: VersionTrial, ticket: int, told: TileHealth) -> Arm | None:
+def _arm(c: SqlConnection, trial: VersionTrial, ticket: int, told: TileHealth) -> Arm | None:
     """Which version a vehicle speaks of; None: not the one that it was to have. The number may be an older one of the
     same content, which a vehicle keeps when a version is taken back.
     """

@@ -13,9 +13,9 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.tile_store import clocks, releasing
-from gnd.tile_store import sqlite_inbox as inbox
-from gnd.tile_store import sqlite_trials as trials
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store import sql_inbox as inbox
+from gnd.tile_store import sql_trials as trials
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.trials import DoubtedReport, VersionTrial
 from gnd.tile_store.values import ReportRow
 
@@ -25,7 +25,7 @@ ALIKE_STATES: Final = 0.5
 """Similarity of two states of a voxel that say the same."""
 
 
-def clear_confirmed(store: SqliteStore, released: VersionTrial, who: str) -> int:
+def clear_confirmed(store: SqlStore, released: VersionTrial, who: str) -> int:
     """Clear the doubts of a tile whose withdrawn version a released one confirms; how many reports that is.
 
     They are not merged again: the released version says what they said.
@@ -39,7 +39,7 @@ def clear_confirmed(store: SqliteStore, released: VersionTrial, who: str) -> int
 
 
 def clear_and_reenter(
-    store: SqliteStore,
+    store: SqlStore,
     place: tuple[str, TileId],
     who: str,
     why: str,
@@ -65,7 +65,7 @@ def clear_and_reenter(
     return cleared
 
 
-def _reentered(store: SqliteStore, layer: str, tile: TileId, now_ns: int) -> Iterator[ReportRow]:
+def _reentered(store: SqlStore, layer: str, tile: TileId, now_ns: int) -> Iterator[ReportRow]:
     """The doubted reports that retention has left, each whole: of one in two parts the second."""
     for one in _doubted(store, layer, tile):
         parts = _parts(store, layer, tile, one.report_id)
@@ -87,15 +87,15 @@ def _reentered(store: SqliteStore, layer: str, tile: TileId, now_ns: int) -> Ite
         )
 
 
-def _parts(store: SqliteStore, layer: str, tile: TileId, report_id: str) -> list[ReportRow]:
+def _parts(store: SqlStore, layer: str, tile: TileId, report_id: str) -> list[ReportRow]:
     return store.look(lambda c: inbox.of_report(c, layer, tile, report_id))
 
 
-def _doubted(store: SqliteStore, layer: str, tile: TileId) -> list[DoubtedReport]:
+def _doubted(store: SqlStore, layer: str, tile: TileId) -> list[DoubtedReport]:
     return [one for one in store.look(lambda c: trials.doubted_reports(c, layer, tile)) if one.cleared_ns is None]
 
 
-def _is_confirmed(store: SqliteStore, withdrawn: VersionTrial, released: VersionTrial) -> bool:
+def _is_confirmed(store: SqlStore, withdrawn: VersionTrial, released: VersionTrial) -> bool:
     """Whether most of what a withdrawn version had changed is so in the released one."""
     changed = np.array(sorted(releasing.changed_voxels(store, withdrawn)), np.int32)
     then = store.get(withdrawn.layer, withdrawn.tile, withdrawn.version)

@@ -13,9 +13,9 @@ from gnd.cloud_merger.release.verdict import LooksTaken, judged
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import clocks, releasing
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.errors import StoreClosed
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.trials import VersionTrial
 
 KEEP_EVERY_S: Final = 1.0
@@ -33,7 +33,7 @@ class ReleaseKeeper:
         now_ns: the time of day, int ns UTC.
     """
 
-    def __init__(self, store: SqliteStore, members: Members, now_ns: Callable[[], int] = clocks.day_ns) -> None:
+    def __init__(self, store: SqlStore, members: Members, now_ns: Callable[[], int] = clocks.day_ns) -> None:
         self._store, self._members, self._now_ns = store, members, now_ns
         self._noted_s: dict[tuple[str, TileId, int], float] = {}
 

@@ -24,10 +24,10 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.survey import SurveyReport
-from gnd.tile_store import clocks, sqlite_roads
+from gnd.tile_store import clocks, sql_roads
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.roads import OpenRoads, RoadTile
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_CODEC, lattice_named
 
 QUIET_S: Final = 2.0
@@ -69,7 +69,7 @@ class RoadMapper:
 
     def __init__(
         self,
-        store: SqliteStore,
+        store: SqlStore,
         owner: str,
         on_published: Callable[[], object] = lambda: None,
         now_ns: Callable[[], int] = clocks.day_ns,
@@ -86,14 +86,14 @@ class RoadMapper:
             StoreError: the store has failed; the lease runs out.
         """
         done = 0
-        for roads in self._store.look(sqlite_roads.open_roads):
+        for roads in self._store.look(sql_roads.open_roads):
             if self._is_ready(roads) and self._leased(roads.layer):
                 done += self._attempt(roads)
         return done
 
     def map_now(self, layer: str) -> RoadsMapped:
         """Map a layer with all parts that are there, ready or not."""
-        parts = self._store.look(lambda c: sqlite_roads.parts(c, layer))
+        parts = self._store.look(lambda c: sql_roads.parts(c, layer))
         pieces = pieces_of(drives_of(_readable(parts)))
         total, self.solved = RoadsMapped(), []
         for piece in pieces:
@@ -107,14 +107,14 @@ class RoadMapper:
         return now - roads.newest_ns > QUIET_S * 1e9 or now - roads.oldest_ns > LONGEST_S * 1e9
 
     def _leased(self, layer: str) -> bool:
-        return self._store.transact(lambda c, _: sqlite_roads.lease(c, layer, self._owner, LEASE_S))
+        return self._store.transact(lambda c, _: sql_roads.lease(c, layer, self._owner, LEASE_S))
 
     def _attempt(self, roads: OpenRoads) -> int:
         """Map what a lease is held for, and give the layer back."""
         made = self.map_now(roads.layer)
         _LOG.info("roads of layer %s: %s", roads.layer, made)
         done = None if made.postponed else roads.arrival
-        self._store.transact(lambda c, _: sqlite_roads.settle(c, roads.layer, self._owner, done))
+        self._store.transact(lambda c, _: sql_roads.settle(c, roads.layer, self._owner, done))
         return int(done is not None)
 
     def _tried(self, layer: str, drives: Sequence[SurveyedDrive]) -> RoadsMapped:
@@ -132,7 +132,7 @@ class RoadMapper:
         frame = frame_of(drives[0])
         if frame is None:
             return RoadsMapped()
-        known = {one.tile: one for one in self._store.look(lambda c: sqlite_roads.tiles(c, layer))}
+        known = {one.tile: one for one in self._store.look(lambda c: sql_roads.tiles(c, layer))}
         before, heads = self._published(layer, drives, known)
         piece = solve_piece(drives, before, frame)
         if piece is None:
@@ -185,12 +185,12 @@ class RoadMapper:
             return RoadsMapped(published=1)  # reports have been merged into it since: what is seen there goes that way
         if state != "published":
             if known is None or not known.version:  # what is published stays, even where a new drive disagrees
-                self._store.transact(lambda c, now: sqlite_roads.put_tile(c, road, now))
+                self._store.transact(lambda c, now: sql_roads.put_tile(c, road, now))
             return RoadsMapped(draft=int(state == "draft"), waiting=int(state == "waiting"))
         tile = Tile(one.tile, head + 1, _joined(before.get(one.tile), new))
         if known is not None and known.version and self._is_head(layer, tile):
             return RoadsMapped(published=1)
-        version = self._store.transact(lambda c, now: sqlite_roads.publish(c, road, tile, head, now))
+        version = self._store.transact(lambda c, now: sql_roads.publish(c, road, tile, head, now, self._store.signing))
         return RoadsMapped(published=1, versions=1) if version is not None else RoadsMapped(postponed=1)
 
     def _is_head(self, layer: str, tile: Tile) -> bool:

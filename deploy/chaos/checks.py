@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import apsw
-
 from gnd.deploy.chaos.clients import Receipt, held_by, read_receipts
 from gnd.deploy.chaos.street import LAYER
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.tile_store.check import check_store
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.connection import SqlConnection, fetch
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.vehicle_agent.link.outbox import Outbox
 
 MOST_NAMED: Final = 20
@@ -140,7 +139,7 @@ def read_outbox(path: Path) -> list[KeptReports]:
     return [KeptReports(ChangeReport.decode(bodies[one]), state, answers[one]) for one, state in states.items()]
 
 
-def compare_reports(found: Findings, store: SqliteStore, kept: Sequence[KeptReports]) -> None:
+def compare_reports(found: Findings, store: SqlStore, kept: Sequence[KeptReports]) -> None:
     """Is every acknowledged report in the journal once, and nothing else?"""
     sent = {one.mark: one for one in kept}
     acknowledged = held_by({one.report.report_id: one.state for one in kept})
@@ -189,7 +188,7 @@ def _agree(change: TileChange, journaled: TileChange) -> bool:
     return ids == (journaled.changed.voxel_id.tolist(), journaled.change_class.tolist(), journaled.base_sha)
 
 
-def compare_tiles(found: Findings, store: SqliteStore, receipts: Sequence[Receipt]) -> None:
+def compare_tiles(found: Findings, store: SqlStore, receipts: Sequence[Receipt]) -> None:
     """Did every tile that came have the content that the store has under its number?"""
     found.received = len(receipts)
     shas: dict[tuple[TileId, int], bytes] = {}
@@ -208,7 +207,7 @@ def compare_tiles(found: Findings, store: SqliteStore, receipts: Sequence[Receip
             )
 
 
-def find_stuck(found: Findings, store: SqliteStore) -> None:
+def find_stuck(found: Findings, store: SqlStore) -> None:
     """Is anything left to do?"""
     found.stuck_tiles += [f"{TileId(tile).path}: {why}" for tile, why in store.look(_unmerged)]
     waiting = {name: n for name, n in store.upload_counts().by_state.items() if name in _UNREAD}
@@ -216,12 +215,11 @@ def find_stuck(found: Findings, store: SqliteStore) -> None:
     found.stuck_tiles += [f"{one.tile.path}: version {one.version} is not announced" for one in store.notices()]
 
 
-def _unmerged(c: apsw.Connection) -> list[tuple[int, str]]:
-    queue = c.execute("SELECT tile, coalesce(aside_reason, 'is waiting to be merged') FROM dirty")
-    queued = [(int(str(tile)), str(why)) for tile, why in queue]
-    rows = c.execute("SELECT tile, count(*) FROM report WHERE merged_in IS NULL GROUP BY layer, tile").fetchall()
+def _unmerged(c: SqlConnection) -> list[tuple[int, str]]:
+    queued = [(int(tile), str(why)) for tile, why in fetch(c, "queued_tiles")]
     known = {tile for tile, _ in queued}
-    forgotten = [(int(str(tile)), f"{n} reports are in no version") for tile, n in rows if tile not in known]
+    rows = fetch(c, "unmerged_reports")
+    forgotten = [(int(tile), f"{n} reports are in no version") for tile, n in rows if tile not in known]
     return queued + forgotten
 
 

@@ -29,7 +29,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import tile_key
 from gnd.tile_store import clocks
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 
 SHARDS: Final = 2
 VEHICLES: Final = 3
@@ -66,7 +66,7 @@ class ChaosCloud:
     connect: str
     supervisor: Supervisor
     wires: Wires
-    store: SqliteStore
+    store: SqlStore
     beacon: Tile
     died: list[str] = field(default_factory=list)
     beacons: int = 0

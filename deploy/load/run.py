@@ -6,10 +6,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+from gnd.cloud_merger.checking import IngestLimits
 from gnd.deploy import roles
 from gnd.deploy.errors import DeployError
 from gnd.deploy.fleet import shard_config
@@ -135,7 +136,8 @@ def _put_streets(streets: Streets, path: Path, tell: Tell, stop: threading.Event
 def _cloud(options: LoadOptions, runs: KeptRuns, folder: Path, stop: threading.Event) -> Iterator[Running]:
     connect = f"tcp/127.0.0.1:{claim_port(0)}"
     store = folder / "store.sqlite"
-    shards = [shard_config(FleetConfig(), f"shard-{n}", store, connect) for n in range(options.shards)]
+    made = (shard_config(FleetConfig(), f"shard-{n}", store, connect) for n in range(options.shards))
+    shards = [replace(one, ingest=IngestLimits(speeds=False)) for one in made]  # streets lie districts apart
     clients = [
         ClientConfig(number, vehicles, options, runs, connect, folder)
         for number, vehicles in enumerate(shared_out(options.vehicles, options.clients))

@@ -23,6 +23,7 @@ from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from gnd.tile_store.compare import MapDiff, map_diff, version_diff
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.export import FORMATS, ExportError, export_map
+from gnd.tile_store.location import LOCATION, StoreLocation
 from gnd.tile_store.options import PATH, json_option, layer_option, region_option, show, to_read
 from gnd.tile_store.store import Store
 
@@ -38,7 +39,7 @@ Written = tuple[dict[str, Any], str]
 
 
 @click.command(short_help="Write a map for Autoware, GIS and point-cloud programs.")
-@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("out", metavar="FILE", type=PATH)
 @click.option("--to", "--format", "kind", type=click.Choice(OUTPUTS), help=TO_HELP)
 @click.option("--projector", type=click.Choice(PROJECTORS), help=PROJECTOR_HELP)
@@ -47,7 +48,7 @@ Written = tuple[dict[str, Any], str]
 @layer_option
 @json_option
 def export(
-    path: Path,
+    path: StoreLocation,
     out: Path,
     kind: str | None,
     projector: str | None,
@@ -87,8 +88,8 @@ def _plain(store: Store, layer: str, region: str, out: Path, name: str) -> Writt
     return asdict(result) | {"path": str(result.path)}, line
 
 
-def _mcap(store: Store, layer: str, region: str, out: Path, path: Path) -> Written:
-    scene = read_scene(store, layer, region, path if path.is_dir() else None)
+def _mcap(store: Store, layer: str, region: str, out: Path, path: StoreLocation) -> Written:
+    scene = read_scene(store, layer, region, path if isinstance(path, Path) and path.is_dir() else None)
     write_mcap(scene, out)
     size_bytes = out.stat().st_size
     values = {
@@ -116,8 +117,8 @@ def _autoware(store: Store, layer: str, region: str, out: Path, projector: str |
 
 
 @click.command(short_help="Where two maps, times or versions differ.")
-@click.argument("old", metavar="STORE", type=PATH)
-@click.argument("new", metavar="[OTHER]", type=PATH, required=False)
+@click.argument("old", metavar="STORE", type=LOCATION)
+@click.argument("new", metavar="[OTHER]", type=LOCATION, required=False)
 @click.option("--since", help="Compare with STORE as it was then: 2026-01-31T12:00:00Z.")
 @click.option("--tile", help="Compare two versions of one tile (path, number, or lat,lon) ...")
 @click.option("--versions", help="... these two: 3..5.  [default: the newest with the one before]")
@@ -126,8 +127,8 @@ def _autoware(store: Store, layer: str, region: str, out: Path, projector: str |
 @layer_option
 @json_option
 def diff(
-    old: Path,
-    new: Path | None,
+    old: StoreLocation,
+    new: StoreLocation | None,
     since: str | None,
     tile: str | None,
     versions: str | None,

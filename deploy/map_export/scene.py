@@ -16,6 +16,7 @@ from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.export import region_frame, region_tiles
+from gnd.tile_store.location import StoreLocation
 from gnd.tile_store.store import Store
 
 if TYPE_CHECKING:
@@ -69,9 +70,9 @@ class ExportScene:
         return min(times, default=1)
 
 
-def store_of(path: Path) -> Path:
-    """The store: the file itself, or that of a run's folder."""
-    return RunFolder(path).store if path.is_dir() else path
+def store_of(path: StoreLocation) -> StoreLocation:
+    """The store: itself, or that of a run's folder."""
+    return RunFolder(path).store if isinstance(path, Path) and path.is_dir() else path
 
 
 def read_scene(store: Store, layer: str, prefix: str, run: Path | None = None) -> ExportScene:

@@ -22,7 +22,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from gnd.fleet_bus.errors import IdentityError
 from gnd.fleet_bus.identity.folder import AUTHORITY, CERTIFICATE, KEY, MEMBERS, REVOKED, load_key, utc_now
 from gnd.fleet_bus.identity.lists import MemberList, replace_file
-from gnd.fleet_bus.identity.names import MemberName
+from gnd.fleet_bus.identity.names import PUBLISHER_ROLES, MemberName
 
 REGISTER: Final = "register.jsonl"
 ROOT_DAYS: Final = 3650
@@ -254,10 +254,14 @@ class Authority:
     def _write_lists(self) -> None:
         now, number = utc_now(), self._last_number() + 1
         shut = [entry for entry in self._entries.values() if entry.shuts_out(now)]
+        # what a publisher has signed stays: so does, when its certificate has ended, that it was taken back
+        gone = [
+            one for one in self._entries.values() if one.revoked and one.role in PUBLISHER_ROLES and one not in shut
+        ]
         names = frozenset(entry.member.common_name for entry in shut)
         holding = (entry.member for entry in self._entries.values() if entry.holds(now))
         members = frozenset(member for member in holding if member.common_name not in names)
-        replace_file(self.folder / REVOKED, self._revoked_list(shut, number, now))
+        replace_file(self.folder / REVOKED, self._revoked_list([*shut, *gone], number, now))
         replace_file(self.folder / MEMBERS, MemberList(number, members, names).encode(self._key))
 
     def _last_number(self) -> int:

@@ -94,11 +94,11 @@ def load_identity(folder: Path) -> MemberIdentity:
         IdentityError: a file is missing or is no PEM, the key is of another certificate, the name is none of ours, or
             the certificate does not come from the authority.
     """
-    chain = _certificates(folder / CERTIFICATE)
-    authority = _certificates(folder / AUTHORITY)
+    chain = certificates_in(folder / CERTIFICATE)
+    authority = certificates_in(folder / AUTHORITY)
     key = load_key(folder / KEY)
     own = chain[0]
-    if _public_bytes(own.public_key()) != _public_bytes(key.public_key()):
+    if not same_key(own, key):
         raise IdentityError(f"{folder / KEY} is the key of another certificate than {folder / CERTIFICATE}")
     member = member_of(own)
     _check_chain(folder, chain, authority)
@@ -151,6 +151,11 @@ def load_key(path: Path) -> ec.EllipticCurvePrivateKey:
     return key
 
 
+def same_key(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> bool:
+    """Whether a private key is that of a certificate."""
+    return _public_bytes(certificate.public_key()) == _public_bytes(key.public_key())
+
+
 def is_issued_by(certificate: x509.Certificate, issuer: x509.Certificate) -> bool:
     """Whether `issuer` is an authority and has signed `certificate`."""
     try:
@@ -185,7 +190,8 @@ def _public_bytes(key: object) -> bytes:
     return key.public_bytes(encoding, form)  # type: ignore[attr-defined,no-any-return]  # every public key has it
 
 
-def _certificates(path: Path) -> tuple[x509.Certificate, ...]:
+def certificates_in(path: Path) -> tuple[x509.Certificate, ...]:
+    """The certificates of a file in PEM, at least one; `IdentityError`."""
     try:
         return tuple(x509.load_pem_x509_certificates(_read(path)))
     except ValueError as error:

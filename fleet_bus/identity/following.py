@@ -1,11 +1,11 @@
-"""A server hears which certificates its authority has taken back, and keeps the list in its identity folder."""
+"""A member hears which certificates its authority has taken back, and keeps the list in its identity folder."""
 
 import logging
 from pathlib import Path
 
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import IdentityError
-from gnd.fleet_bus.rights import AUTHORITY_KEYS
+from gnd.fleet_bus.rights import REVOKED_KEY
 
 _LOG = logging.getLogger(__name__)
 
@@ -16,14 +16,13 @@ def follow_revoked(bus: Bus) -> None:
     if folder is None:
         return
 
-    def note(key: str, payload: bytes) -> None:
-        if key.endswith("/revoked"):
-            try:
-                take_revoked(folder, payload)
-            except (IdentityError, OSError) as error:
-                _LOG.warning("a list of the revoked is not taken: %s", error)
+    def note(_key: str, payload: bytes) -> None:
+        try:
+            take_revoked(folder, payload)
+        except (IdentityError, OSError) as error:
+            _LOG.warning("a list of the revoked is not taken: %s", error)
 
-    bus.subscribe(AUTHORITY_KEYS, note, kind="control")
+    bus.subscribe(REVOKED_KEY, note, kind="control")
 
 
 def take_revoked(folder: Path, data: bytes) -> bool:

@@ -9,6 +9,8 @@ from typing import Final, Self
 from gnd.fleet_bus.errors import IdentityError
 
 ROLES: Final = ("vehicle", "shard", "tiles", "operator", "router")
+PUBLISHER_ROLES: Final = ("shard", "operator")
+"""Who may sign versions: shards what they merge, operators what they import, roll back or have checked."""
 IDENTITY_VARIABLE: Final = "GND_IDENTITY"
 """Environment variable: the identity folder of a process, as `--identity` gives it."""
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")

@@ -25,6 +25,9 @@ _SAME: Final = 1e-12
 _MAX_PIECES: Final = 100_000
 _ROWS: Final = 64
 """So many segments at a time are compared with all later ones: memory stays at some megabytes."""
+MAX_PAIRS: Final = 65_536
+"""Pairs of segments of a polyline whose boxes meet, each of which is looked at for a crossing. A lane has little more
+of them than segments; 4,096 points in one place would have 8 million, 2 s of CPU."""
 _ONE_DIRECTION: Final = 1e-12
 _ON_LINE_M: Final = 1e-9
 
@@ -158,7 +161,7 @@ def check_simple_polyline(name: str, points_m: F64) -> None:
         points_m: (N, 2) or (N, 3); a vertex that repeats the one before counts once.
 
     Raises:
-        FeatureError: says which segments meet, and where.
+        FeatureError: says which segments meet, and where; more segments lie over each other than are looked at.
     """
     xy = np.asarray(points_m, dtype=np.float64)[:, :2]
     kept = np.flatnonzero(np.concatenate([[True], (np.diff(xy, axis=0) != 0.0).any(axis=1)]))
@@ -176,8 +179,14 @@ def _first_meeting(line: F64) -> tuple[int, int] | None:
     start, step = line[:-1], np.diff(line, axis=0)
     low, high = np.minimum(line[:-1], line[1:]), np.maximum(line[:-1], line[1:])
     is_loop = len(line) > 2 and np.array_equal(line[0], line[-1])
+    pairs = 0
     for first in range(0, len(step), _ROWS):
         i, j = _boxes_meeting(low[first:], high[first:])
+        pairs += len(i)
+        if pairs > MAX_PAIRS:
+            raise FeatureError(
+                f"more than {MAX_PAIRS} pairs of {len(step)} segments lie in one place: too many to look for crossings"
+            )
         i, j = i + first, j + first
         meets = _meeting(start[i], step[i], start[j], step[j])
         meets &= (j > i + 1) | ((step[i] * step[j]).sum(axis=1) < 0.0) & _parallel(step[i], step[j])

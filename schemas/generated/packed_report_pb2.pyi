@@ -44,6 +44,8 @@ class PackedReport(_message.Message):
     DOUBTFUL_FIELD_NUMBER: _builtins.int
     DOUBTS_FIELD_NUMBER: _builtins.int
     COURSE_FIELD_NUMBER: _builtins.int
+    UNSURE_FIELD_NUMBER: _builtins.int
+    UNSURE_MEASURED_FIELD_NUMBER: _builtins.int
     report_id: _builtins.bytes
     """The report's ULID as 16 bytes."""
     vehicle: _builtins.str
@@ -75,6 +77,15 @@ class PackedReport(_message.Message):
     pose_sigma_10urad: _builtins.int
     """Standard deviation of the refined attitude about its worst axis, the largest of the report's tiles.
     [10 microradians, rounded up]
+    """
+    unsure: _builtins.bytes
+    """Voxels of each tile in which the vehicle compared with no Gaussian and met something, but too little to decide: coded
+    as `flags`, all of them new, none of them among `flags`. They are not observed, whatever `track` predicts. Absent =
+    none.
+    """
+    unsure_measured: _builtins.bytes
+    """What the vehicle measured in them: coded as gnd_map.codec.encode_measured; of those tiles only that have any. The
+    number of points is that of the 10 cm sub-cells that half as many points would have met. [1 .. 19]
     """
     @_builtins.property
     def doubtful(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
@@ -108,10 +119,12 @@ class PackedReport(_message.Message):
         doubtful: _abc.Iterable[_builtins.int] | None = ...,
         doubts: _abc.Iterable[_doubt_pb2.Doubt] | None = ...,
         course: _course_pb2.Course | None = ...,
+        unsure: _builtins.bytes = ...,
+        unsure_measured: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["course", b"course"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "course", b"course", "doubtful", b"doubtful", "doubts", b"doubts", "first_ns", b"first_ns", "flags", b"flags", "length_ns", b"length_ns", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "vehicle", b"vehicle"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "course", b"course", "doubtful", b"doubtful", "doubts", b"doubts", "first_ns", b"first_ns", "flags", b"flags", "length_ns", b"length_ns", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "unsure", b"unsure", "unsure_measured", b"unsure_measured", "vehicle", b"vehicle"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

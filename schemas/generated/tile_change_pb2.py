@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from . import doubt_pb2 as gnd_dot_v1_dot_doubt__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18gnd/v1/tile_change.proto\x12\x06gnd.v1\x1a\x12gnd/v1/doubt.proto\"\x8a\x02\n\nTileChange\x12\x0c\n\x04tile\x18\x01 \x01(\x04\x12\x14\n\x0c\x62\x61se_version\x18\x02 \x01(\r\x12\x10\n\x08\x62\x61se_sha\x18\x03 \x01(\x0c\x12\x16\n\x0eobserved_first\x18\x04 \x01(\x11\x12\x17\n\x0fobserved_bitmap\x18\x05 \x01(\x0c\x12\x10\n\x08\x63odec_id\x18\x06 \x01(\r\x12\x0f\n\x07\x63hanged\x18\x07 \x01(\x0c\x12\x14\n\x0c\x63hange_class\x18\x08 \x01(\x0c\x12\x10\n\x08\x65vidence\x18\t \x03(\r\x12\x14\n\x0cpose_sigma_m\x18\n \x01(\x01\x12\x16\n\x0epose_sigma_rad\x18\x0b \x01(\x01\x12\x1c\n\x05\x64oubt\x18\x0c \x01(\x0b\x32\r.gnd.v1.Doubtb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18gnd/v1/tile_change.proto\x12\x06gnd.v1\x1a\x12gnd/v1/doubt.proto\"\x9a\x02\n\nTileChange\x12\x0c\n\x04tile\x18\x01 \x01(\x04\x12\x14\n\x0c\x62\x61se_version\x18\x02 \x01(\r\x12\x10\n\x08\x62\x61se_sha\x18\x03 \x01(\x0c\x12\x16\n\x0eobserved_first\x18\x04 \x01(\x11\x12\x17\n\x0fobserved_bitmap\x18\x05 \x01(\x0c\x12\x10\n\x08\x63odec_id\x18\x06 \x01(\r\x12\x0f\n\x07\x63hanged\x18\x07 \x01(\x0c\x12\x14\n\x0c\x63hange_class\x18\x08 \x01(\x0c\x12\x10\n\x08\x65vidence\x18\t \x03(\r\x12\x14\n\x0cpose_sigma_m\x18\n \x01(\x01\x12\x16\n\x0epose_sigma_rad\x18\x0b \x01(\x01\x12\x1c\n\x05\x64oubt\x18\x0c \x01(\x0b\x32\r.gnd.v1.Doubt\x12\x0e\n\x06unsure\x18\r \x01(\x0c\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,5 +33,5 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.tile_
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_TILECHANGE']._serialized_start=57
-  _globals['_TILECHANGE']._serialized_end=323
+  _globals['_TILECHANGE']._serialized_end=339
 # @@protoc_insertion_point(module_scope)

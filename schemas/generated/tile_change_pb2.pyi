@@ -37,6 +37,7 @@ class TileChange(_message.Message):
     POSE_SIGMA_M_FIELD_NUMBER: _builtins.int
     POSE_SIGMA_RAD_FIELD_NUMBER: _builtins.int
     DOUBT_FIELD_NUMBER: _builtins.int
+    UNSURE_FIELD_NUMBER: _builtins.int
     tile: _builtins.int
     """Morton code of the tile: longitude index on the even bits, latitude index on the odd bits. [0 .. 2^39)"""
     base_version: _builtins.int
@@ -61,6 +62,11 @@ class TileChange(_message.Message):
     """Standard deviation of the vehicle's refined position in its worst direction, over the scans that saw this tile. [m]"""
     pose_sigma_rad: _builtins.float
     """Standard deviation of the vehicle's refined attitude about its worst axis, over the scans that saw this tile. [rad]"""
+    unsure: _builtins.bytes
+    """Voxels in which the vehicle compared with no Gaussian and met something, but too little to decide: encoded as
+    `changed`, none of them observed. The number of points is that of the 10 cm sub-cells that half as many points would
+    have met. [1 .. 19] Absent = none.
+    """
     @_builtins.property
     def evidence(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """Four counters of rays a changed voxel, in the order of `changed`: blocked inside, blocked outside, blocked in an
@@ -86,10 +92,11 @@ class TileChange(_message.Message):
         pose_sigma_m: _builtins.float = ...,
         pose_sigma_rad: _builtins.float = ...,
         doubt: _doubt_pb2.Doubt | None = ...,
+        unsure: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["doubt", b"doubt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_sha", b"base_sha", "base_version", b"base_version", "change_class", b"change_class", "changed", b"changed", "codec_id", b"codec_id", "doubt", b"doubt", "evidence", b"evidence", "observed_bitmap", b"observed_bitmap", "observed_first", b"observed_first", "pose_sigma_m", b"pose_sigma_m", "pose_sigma_rad", b"pose_sigma_rad", "tile", b"tile"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_sha", b"base_sha", "base_version", b"base_version", "change_class", b"change_class", "changed", b"changed", "codec_id", b"codec_id", "doubt", b"doubt", "evidence", b"evidence", "observed_bitmap", b"observed_bitmap", "observed_first", b"observed_first", "pose_sigma_m", b"pose_sigma_m", "pose_sigma_rad", b"pose_sigma_rad", "tile", b"tile", "unsure", b"unsure"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

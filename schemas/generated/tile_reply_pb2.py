@@ -24,17 +24,18 @@ _sym_db = _symbol_database.Default()
 
 from . import coded_delta_pb2 as gnd_dot_v1_dot_coded__delta__pb2
 from . import tile_blob_pb2 as gnd_dot_v1_dot_tile__blob__pb2
+from . import version_signatures_pb2 as gnd_dot_v1_dot_version__signatures__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gnd/v1/tile_reply.proto\x12\x06gnd.v1\x1a\x18gnd/v1/coded_delta.proto\x1a\x16gnd/v1/tile_blob.proto\"\xf5\x01\n\tTileReply\x12\r\n\x05major\x18\x01 \x01(\r\x12(\n\x06status\x18\x02 \x01(\x0e\x32\x18.gnd.v1.TileReply.Status\x12\x1e\n\x04\x62lob\x18\x03 \x01(\x0b\x32\x10.gnd.v1.TileBlob\x12!\n\x05\x64\x65lta\x18\x04 \x01(\x0b\x32\x12.gnd.v1.CodedDelta\"l\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x0f\n\x0bSTATUS_BLOB\x10\x01\x12\x14\n\x10STATUS_UNCHANGED\x10\x02\x12\x11\n\rSTATUS_ABSENT\x10\x03\x12\x10\n\x0cSTATUS_DELTA\x10\x04\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gnd/v1/tile_reply.proto\x12\x06gnd.v1\x1a\x18gnd/v1/coded_delta.proto\x1a\x16gnd/v1/tile_blob.proto\x1a\x1fgnd/v1/version_signatures.proto\"\xa4\x02\n\tTileReply\x12\r\n\x05major\x18\x01 \x01(\r\x12(\n\x06status\x18\x02 \x01(\x0e\x32\x18.gnd.v1.TileReply.Status\x12\x1e\n\x04\x62lob\x18\x03 \x01(\x0b\x32\x10.gnd.v1.TileBlob\x12!\n\x05\x64\x65lta\x18\x04 \x01(\x0b\x32\x12.gnd.v1.CodedDelta\x12-\n\nsignatures\x18\x05 \x01(\x0b\x32\x19.gnd.v1.VersionSignatures\"l\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x0f\n\x0bSTATUS_BLOB\x10\x01\x12\x14\n\x10STATUS_UNCHANGED\x10\x02\x12\x11\n\rSTATUS_ABSENT\x10\x03\x12\x10\n\x0cSTATUS_DELTA\x10\x04\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.tile_reply_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_TILEREPLY']._serialized_start=86
-  _globals['_TILEREPLY']._serialized_end=331
-  _globals['_TILEREPLY_STATUS']._serialized_start=223
-  _globals['_TILEREPLY_STATUS']._serialized_end=331
+  _globals['_TILEREPLY']._serialized_start=119
+  _globals['_TILEREPLY']._serialized_end=411
+  _globals['_TILEREPLY_STATUS']._serialized_start=303
+  _globals['_TILEREPLY_STATUS']._serialized_end=411
 # @@protoc_insertion_point(module_scope)

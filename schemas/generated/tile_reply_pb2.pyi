@@ -5,6 +5,7 @@ isort:skip_file
 
 from . import coded_delta_pb2 as _coded_delta_pb2
 from . import tile_blob_pb2 as _tile_blob_pb2
+from . import version_signatures_pb2 as _version_signatures_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
@@ -56,6 +57,7 @@ class TileReply(_message.Message):
     STATUS_FIELD_NUMBER: _builtins.int
     BLOB_FIELD_NUMBER: _builtins.int
     DELTA_FIELD_NUMBER: _builtins.int
+    SIGNATURES_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     status: Global___TileReply.Status.ValueType
@@ -67,6 +69,10 @@ class TileReply(_message.Message):
     def delta(self) -> _coded_delta_pb2.CodedDelta:
         """Set exactly when status = STATUS_DELTA."""
 
+    @_builtins.property
+    def signatures(self) -> _version_signatures_pb2.VersionSignatures:
+        """Who answers for the version in `blob` or `delta`; missing = it is not signed."""
+
     def __init__(
         self,
         *,
@@ -74,10 +80,11 @@ class TileReply(_message.Message):
         status: Global___TileReply.Status.ValueType = ...,
         blob: _tile_blob_pb2.TileBlob | None = ...,
         delta: _coded_delta_pb2.CodedDelta | None = ...,
+        signatures: _version_signatures_pb2.VersionSignatures | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob", "delta", b"delta"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob", "delta", b"delta", "signatures", b"signatures"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob", "delta", b"delta", "major", b"major", "status", b"status"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob", "delta", b"delta", "major", b"major", "signatures", b"signatures", "status", b"status"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from . import tile_delta_pb2 as gnd_dot_v1_dot_tile__delta__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18gnd/v1/tile_update.proto\x12\x06gnd.v1\x1a\x17gnd/v1/tile_delta.proto\"\xa6\x03\n\nTileUpdate\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0c\n\x04tile\x18\x02 \x01(\x04\x12\r\n\x05layer\x18\x03 \x01(\t\x12\x0f\n\x07version\x18\x04 \x01(\r\x12\x18\n\x10previous_version\x18\x05 \x01(\r\x12\x0b\n\x03sha\x18\x06 \x01(\x0c\x12\x14\n\x0cprevious_sha\x18\x07 \x01(\x0c\x12)\n\x06reason\x18\x08 \x01(\x0e\x32\x19.gnd.v1.TileUpdate.Reason\x12 \n\x05\x64\x65lta\x18\t \x01(\x0b\x32\x11.gnd.v1.TileDelta\x12\x13\n\x0b\x63oded_delta\x18\n \x01(\x0c\x12\x12\n\nput_voxels\x18\x0b \x01(\r\x12\x16\n\x0eremoved_voxels\x18\x0c \x01(\r\x12\x0b\n\x03\x64\x61y\x18\r \x01(\r\x12\x11\n\tput_count\x18\x0e \x01(\r\x12\x15\n\rremoved_count\x18\x0f \x01(\r\"Y\n\x06Reason\x12\x16\n\x12REASON_UNSPECIFIED\x10\x00\x12\x11\n\rREASON_MERGED\x10\x01\x12\x0f\n\x0bREASON_BASE\x10\x02\x12\x13\n\x0fREASON_ROLLBACK\x10\x03\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18gnd/v1/tile_update.proto\x12\x06gnd.v1\x1a\x17gnd/v1/tile_delta.proto\"\xb6\x03\n\nTileUpdate\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0c\n\x04tile\x18\x02 \x01(\x04\x12\r\n\x05layer\x18\x03 \x01(\t\x12\x0f\n\x07version\x18\x04 \x01(\r\x12\x18\n\x10previous_version\x18\x05 \x01(\r\x12\x0b\n\x03sha\x18\x06 \x01(\x0c\x12\x14\n\x0cprevious_sha\x18\x07 \x01(\x0c\x12)\n\x06reason\x18\x08 \x01(\x0e\x32\x19.gnd.v1.TileUpdate.Reason\x12 \n\x05\x64\x65lta\x18\t \x01(\x0b\x32\x11.gnd.v1.TileDelta\x12\x13\n\x0b\x63oded_delta\x18\n \x01(\x0c\x12\x12\n\nput_voxels\x18\x0b \x01(\r\x12\x16\n\x0eremoved_voxels\x18\x0c \x01(\r\x12\x0b\n\x03\x64\x61y\x18\r \x01(\r\x12\x11\n\tput_count\x18\x0e \x01(\r\x12\x15\n\rremoved_count\x18\x0f \x01(\r\x12\x0e\n\x06made_s\x18\x10 \x01(\x04\"Y\n\x06Reason\x12\x16\n\x12REASON_UNSPECIFIED\x10\x00\x12\x11\n\rREASON_MERGED\x10\x01\x12\x0f\n\x0bREASON_BASE\x10\x02\x12\x13\n\x0fREASON_ROLLBACK\x10\x03\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,7 +33,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.tile_
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_TILEUPDATE']._serialized_start=62
-  _globals['_TILEUPDATE']._serialized_end=484
-  _globals['_TILEUPDATE_REASON']._serialized_start=395
-  _globals['_TILEUPDATE_REASON']._serialized_end=484
+  _globals['_TILEUPDATE']._serialized_end=500
+  _globals['_TILEUPDATE_REASON']._serialized_start=411
+  _globals['_TILEUPDATE_REASON']._serialized_end=500
 # @@protoc_insertion_point(module_scope)

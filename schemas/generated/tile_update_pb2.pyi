@@ -62,6 +62,7 @@ class TileUpdate(_message.Message):
     DAY_FIELD_NUMBER: _builtins.int
     PUT_COUNT_FIELD_NUMBER: _builtins.int
     REMOVED_COUNT_FIELD_NUMBER: _builtins.int
+    MADE_S_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     tile: _builtins.int
@@ -93,6 +94,8 @@ class TileUpdate(_message.Message):
     """Voxels or features that come or change by this version, where the notice has no delta to tell. [voxels or features]"""
     removed_count: _builtins.int
     """Voxels or features that go by this version, where the notice has no delta to tell. [voxels or features]"""
+    made_s: _builtins.int
+    """When the new version was made, by the store; told where versions are signed. [s, POSIX time; 0 = not told]"""
     @_builtins.property
     def delta(self) -> _tile_delta_pb2.TileDelta:
         """What turns the previous content into the new one, in plain columns; missing = see `coded_delta`."""
@@ -115,10 +118,11 @@ class TileUpdate(_message.Message):
         day: _builtins.int = ...,
         put_count: _builtins.int = ...,
         removed_count: _builtins.int = ...,
+        made_s: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["delta", b"delta"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["coded_delta", b"coded_delta", "day", b"day", "delta", b"delta", "layer", b"layer", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "put_count", b"put_count", "put_voxels", b"put_voxels", "reason", b"reason", "removed_count", b"removed_count", "removed_voxels", b"removed_voxels", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["coded_delta", b"coded_delta", "day", b"day", "delta", b"delta", "layer", b"layer", "made_s", b"made_s", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "put_count", b"put_count", "put_voxels", b"put_voxels", "reason", b"reason", "removed_count", b"removed_count", "removed_voxels", b"removed_voxels", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -4,6 +4,7 @@ isort:skip_file
 """
 
 from collections import abc as _abc
+from . import version_signatures_pb2 as _version_signatures_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -70,6 +71,7 @@ class TilesReply(_message.Message):
     BODIES_FIELD_NUMBER: _builtins.int
     DAYS_FIELD_NUMBER: _builtins.int
     WATCHED_FIELD_NUMBER: _builtins.int
+    SIGNATURES_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     hashes: _builtins.bytes
@@ -104,6 +106,10 @@ class TilesReply(_message.Message):
         say how it fares there (HealthReport), whichever version it has got.
         """
 
+    @_builtins.property
+    def signatures(self) -> _version_signatures_pb2.VersionSignatures:
+        """Who answers for each blob and delta, in order; missing = none is signed."""
+
     def __init__(
         self,
         *,
@@ -115,10 +121,11 @@ class TilesReply(_message.Message):
         bodies: _abc.Iterable[_builtins.bytes] | None = ...,
         days: _abc.Iterable[_builtins.int] | None = ...,
         watched: _abc.Iterable[_builtins.int] | None = ...,
+        signatures: _version_signatures_pb2.VersionSignatures | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["signatures", b"signatures"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "days", b"days", "hashes", b"hashes", "major", b"major", "runs", b"runs", "versions", b"versions", "watched", b"watched"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "days", b"days", "hashes", b"hashes", "major", b"major", "runs", b"runs", "signatures", b"signatures", "versions", b"versions", "watched", b"watched"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

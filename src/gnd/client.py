@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Self
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.errors import BusClosed, BusError
+from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.region import Region, as_region
@@ -78,7 +79,9 @@ def connect(router: str = DEFAULT_ENDPOINT, *, timeout_s: float = 10.0) -> "Clie
         NoRouter: nothing answers at `router` within `timeout_s`; the message says both.
         BusConfigError: `router` is no endpoint.
     """
-    return Client(open_bus(BusConfig(connect=(router,), open_timeout_s=timeout_s), name="client"), timeout_s)
+    bus = open_bus(BusConfig(connect=(router,), open_timeout_s=timeout_s), name="client")
+    follow_revoked(bus)
+    return Client(bus, timeout_s)
 
 
 class Client:
@@ -87,6 +90,7 @@ class Client:
     def __init__(self, bus: Bus, timeout_s: float) -> None:
         self._bus, self._timeout_s = bus, timeout_s
         self._streams: list[UpdateStream] = []
+        self._asked: dict[str, TileServerClient] = {}  # each remembers the newest versions that it has seen
 
     def __enter__(self) -> Self:
         return self
@@ -179,7 +183,7 @@ class Client:
         return stream
 
     def _asking(self, layer: str) -> TileServerClient:
-        return TileServerClient(self._bus, layer, self._timeout_s)
+        return self._asked.setdefault(layer, TileServerClient(self._bus, layer, self._timeout_s))
 
 
 class UpdateStream:

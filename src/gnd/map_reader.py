@@ -21,7 +21,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.arguments import parse_tile, parse_time_ns
 from gnd.tile_store.compare import MapDiff, map_diff, version_diff
 from gnd.tile_store.errors import UnknownVersion
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER, StoredTile, VersionInfo
 
 AnyRegion = Region | TileId | str | None
@@ -121,7 +121,7 @@ class Map:
         self._store.close()
 
     @property
-    def store(self) -> SqliteStore:
+    def store(self) -> SqlStore:
         """The store behind it, for what this class does not do."""
         return self._store
 
@@ -244,7 +244,7 @@ class Map:
         stored = self._store.get(layer, tile, version, at_ns)
         if stored is None:
             which = f"version {version}" if version is not None else "tile" if at_ns is None else "version then"
-            raise UnknownVersion(f"{self._store.path}, layer {layer}, tile {tile}: there is no such {which}")
+            raise UnknownVersion(f"{self._store.location}, layer {layer}, tile {tile}: there is no such {which}")
         return stored
 
     def _of_region(self, region: Region, layer: str, at_ns: int | None) -> Iterator[StoredTile]:

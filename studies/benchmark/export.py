@@ -22,7 +22,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from gnd.schemas.drive_mcap import DriveWriter
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from studies.benchmark.errors import BenchmarkError
 from studies.benchmark.files import read_json, sha_of, whole_folder, write_cloud, write_json, write_table
 from studies.benchmark.frames import IndexFrame
@@ -241,7 +241,7 @@ def write_poses(path: Path, poses: list[ReferencePose]) -> None:
     write_table(path, ("t_ns", "x", "y", "z", *_ROTATED), columns, ("%d",) + ("%.4f",) * 3 + ("%.9f",) * 4)
 
 
-def tiles_of(store: SqliteStore) -> dict[TileId, Tile]:
+def tiles_of(store: SqlStore) -> dict[TileId, Tile]:
     """Return all tiles of a store."""
     found = {entry.tile: store.get("ndt", entry.tile) for entry in store.heads()}
     return {tile_id: stored.decode_gaussians() for tile_id, stored in found.items() if stored is not None}

@@ -35,7 +35,11 @@ T = TypeVar("T")
 
 @lru_cache
 def sources_sha(parts: tuple[str, ...]) -> str:
-    """Return the SHA-256, hexadecimal, over the programs and tables of packages, folders and files of this project."""
+    """Return the SHA-256, hexadecimal, over the programs and tables of packages, folders and files of this project.
+
+    Raises:
+        FileNotFoundError: one of them is not there: what it was would decide a result and no key.
+    """
     digest = hashlib.sha256()
     for part in parts:
         for path in _files(part):
@@ -49,6 +53,8 @@ def _files(part: str) -> Iterable[Path]:
     path = Path(str(importlib.resources.files(name))) / inside
     if path.is_file():
         return [path]
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}, which results depend on, is not there")
     return sorted(p for p in path.rglob("*") if p.suffix in _SUFFIXES and p.name not in _DECIDE_NOTHING)
 
 

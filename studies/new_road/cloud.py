@@ -20,7 +20,7 @@ from gnd.gnd_map.se3 import T_inverse
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.survey import SurveyReport
-from gnd.tile_store import sqlite_roads
+from gnd.tile_store import sql_roads
 from gnd.tile_store.roads import RoadTile
 from gnd.tile_store.sqlite_store import SqliteStore
 from studies.new_road.driving import DrivenRoad
@@ -49,7 +49,7 @@ def map_roads(store_path: Path, base: BaseMap, drives: Sequence[DrivenRoad], rec
                 inbox.keep(key, SurveyReport.decode(body), received_ns + number)
             begun_s = perf_counter()
             made = mapper.map_now("ndt")
-            roads = store.look(lambda c: sqlite_roads.tiles(c, "ndt"))
+            roads = store.look(lambda c: sql_roads.tiles(c, "ndt"))
             rounds[number] = {"made": made, "seconds": perf_counter() - begun_s, "roads": roads}
         return {"rounds": rounds, "last": mapper.solved}
 

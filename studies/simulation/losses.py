@@ -22,8 +22,8 @@ from studies.frame.folder import StudyFolder
 from studies.frame.options import PATH
 from studies.frame.tables import print_sheets, sheet, shown
 from studies.simulation.base_map import BaseMap
-from studies.simulation.cloud import map_of_one, merged_map
-from studies.simulation.options import MethodParameters
+from studies.simulation.cloud import arrived, map_of_one, merged_map
+from studies.simulation.options import MethodParameters, Upload
 from studies.simulation.result import EVIDENCE, VehicleResult, read_result
 from studies.simulation.worlds import WorldFiles, read_world_base
 
@@ -121,6 +121,7 @@ class LossCase:
     base: BaseMap
     vehicles: Sequence[VehicleResult]
     method: MethodParameters
+    upload: Upload = "full"
     exact: "LossCase | None" = None
     """The same world and fleet with true poses: what is right there is wrong here because of the poses."""
 
@@ -152,10 +153,16 @@ def fleet_losses(case: LossCase, n: int, level: Level) -> list[Loss]:
 
 
 def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bool = False) -> ClassArray:
-    """Return the class, uint8 (V,), of each voxel after the vehicles' reports, merged or of one vehicle alone."""
-    bodies = [body for vehicle in vehicles for body in vehicle.reports]
+    """Return the class, uint8 (V,), of each voxel after the vehicles' reports, merged as they were sent, or of one
+    vehicle alone.
+    """
     parked_h, merging = case.method.parked_h, case.method.merge
-    final = (merged_map if merge else map_of_one)(case.base, bodies, merging, parked_h)
+    if merge:
+        held = arrived(case.base, vehicles, merging, case.upload)
+        final = merged_map(case.base, [body for one in held for body in one.bodies], merging, parked_h)
+    else:
+        bodies = [body for vehicle in vehicles for body in vehicle.reports]
+        final = map_of_one(case.base, bodies, merging, parked_h)
     return classes_of_maps(case.truth, case.base.tiles, final)
 
 
@@ -275,7 +282,8 @@ def analyse(
 
 def _cases(out: Path, mark: dict[str, Any], changes: Sequence[str]) -> list[LossCase]:
     method = from_mapping(MethodParameters, mark["options"]["method"]).with_changes(changes)
-    return [_case(out, world, mark["options"]["base"], method) for world in mark["worlds"]]
+    options = mark["options"]
+    return [_case(out, world, options["base"], method, options["upload"]) for world in mark["worlds"]]
 
 
 def _beside(cases: Sequence[LossCase], mark: dict[str, Any], exact: Path, changes: Sequence[str]) -> list[LossCase]:
@@ -288,10 +296,10 @@ def _beside(cases: Sequence[LossCase], mark: dict[str, Any], exact: Path, change
     return [replace(a, exact=b) for a, b in zip(cases, _cases(exact, other, changes), strict=True)]
 
 
-def _case(out: Path, world: dict[str, Any], base: str, method: MethodParameters) -> LossCase:
+def _case(out: Path, world: dict[str, Any], base: str, method: MethodParameters, upload: Upload) -> LossCase:
     files = WorldFiles(out / world["folder"], base)
     vehicles = [read_result(out / v["file"], v["key"]) for v in world["vehicles"]]
-    return LossCase(read_truth(files.truth), read_world_base(files), vehicles, method)
+    return LossCase(read_truth(files.truth), read_world_base(files), vehicles, method, upload)
 
 
 def _losses_at(cases: Sequence[LossCase], stage: str, level: Level, sensors: Sequence[str]) -> list[Loss]:

@@ -19,7 +19,7 @@ from studies.simulation.vehicle import VehicleTask
 
 VEHICLE: Final = (
     *SIMULATOR,
-    *(f"vehicle_agent/{name}" for name in ("detect", "localise", "segment", "report.py", "packing.py", "tracks.py")),
+    *(f"vehicle_agent/{name}" for name in ("detect", "localise", "segment", "report", "tracks.py")),
     "vehicle_agent/tiles_at_hand.py",
     *(f"vehicle_agent/{name}.py" for name in ("local_map", "pipeline", "place", "scans", "surroundings")),
     *(f"studies/simulation/{name}.py" for name in ("vehicle", "poses", "base_map")),

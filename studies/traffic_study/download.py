@@ -20,7 +20,7 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.keys import batch_key
 from gnd.schemas.tiles_batch import HeldVersion, TilesReply, TilesRequest
 from gnd.tile_store.answers import TileAnswers
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
 from gnd.vehicle_agent.link.download import DOWNLOAD_BATCH_S
@@ -80,7 +80,7 @@ class Question:
 class Server:
     """The tile server's answers from a store, without a bus."""
 
-    def __init__(self, store: SqliteStore) -> None:
+    def __init__(self, store: SqlStore) -> None:
         self._answers: Final = TileAnswers(store)
 
     def ask(self, district: District, request: TilesRequest) -> tuple[int, int, TilesReply]:
@@ -153,7 +153,7 @@ def fetched_tiles(questions: Iterable[Question]) -> tuple[TileId, ...]:
     return tuple(tile for question in questions for tile in question.fetched)
 
 
-def store_of(path: Path, *states: Mapping[TileId, Gaussians]) -> SqliteStore:
+def store_of(path: Path, *states: Mapping[TileId, Gaussians]) -> SqlStore:
     """A new store with one version a state, the oldest first; an older store there is removed."""
     for old in path.parent.glob(f"{path.name}*"):
         old.unlink()

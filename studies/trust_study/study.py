@@ -23,8 +23,20 @@ from studies.trust_study.attackers import KINDS, TOGETHER, Lies, claimed, lie_of
 from studies.trust_study.cloud import CloudRun, run_cloud
 
 ALL_KINDS: Final = (*KINDS, "mixed", "one_of_two", "one_of_three")
+HONEST_ONLY: Final = "none"
 _SMALL: Final = {"one_of_two": 2, "one_of_three": 3}
 _MOVED_M: Final = 0.1
+_JUDGED: Final = tuple(f"honest_{name}" for name in ("quarantined", "shifted", "unbelieved", "grouped", "unheard"))
+_HONEST: Final = {
+    "honest vehicles": "{honest}",
+    "F1": "{f1:.1f}",
+    "quarantined": "{honest_quarantined}",
+    "shifted": "{honest_shifted}",
+    "not believed alone": "{honest_unbelieved}",
+    "in groups": "{honest_grouped}",
+    "not heard somewhere": "{honest_unheard}",
+    "most alone": "{alone}",
+}
 _SHOWN: Final = {
     "kind": "{kind}",
     "bad": "{bad}",
@@ -44,7 +56,9 @@ class TrustOptions:
     seeds: tuple[int, ...] = seeds(11, text="Seeds of the world.")
     vehicles: int = option(20, "Vehicles of the fleet.", span=(3, 200))
     bad: float = option(0.3, "Share of them that is bad.", span=(0, 0.9))
-    kinds: tuple[str, ...] = option(ALL_KINDS, "What the bad ones do.", known=ALL_KINDS)
+    kinds: tuple[str, ...] = option(
+        ALL_KINDS, "What the bad ones do; none: all are honest.", known=(*ALL_KINDS, HONEST_ONLY)
+    )
     street: Any = street_option(120.0)
     apart_min: float = option(3.0, "Minutes between the starts of two vehicles.", "--apart", span=(0, 1e5))
     parking: float | None = option(None, "Share of parking slots that are taken.", span=(0, 1))
@@ -70,21 +84,25 @@ def trust(options: TrustOptions, bench: Bench) -> StudyReport:
     run = options.run()
     files = {seed: world_files(bench.folder, seed, run) for seed in options.seeds}
     bench.run("worlds", [Job(f"world {seed}", prepare_world, (files[seed], seed, run)) for seed in files])
-    tasks = {seed: vehicle_tasks(run, seed, files[seed]) for seed in files}
+    tasks = {seed: vehicle_tasks(run, seed, files[seed])[: options.vehicles] for seed in files}
     bench.run("vehicles", drive_jobs(task for of_world in tasks.values() for task in of_world))
     kept = {seed: [VehicleFile(one.result, one.key) for one in of_world] for seed, of_world in tasks.items()}
-    names = ("honest", *options.kinds)
+    kinds = tuple(kind for kind in options.kinds if kind != HONEST_ONLY)
+    names = ("honest", *kinds)
     jobs = [
-        Job(f"{kind}, world {seed}", run_kind, (files[seed], kept[seed][: options.vehicles], kind, options.bad, seed))
+        Job(f"{kind}, world {seed}", run_kind, (files[seed], kept[seed], kind, options.bad, seed))
         for seed in files
         for kind in names
     ]
     results = iter(bench.run("fleets", jobs))
     worlds = {str(seed): {kind: next(results) for kind in names} for seed in files}
-    found = {"seeds": list(options.seeds), **_mean_of(list(worlds.values()), options.kinds), "worlds": worlds}
+    found = {"seeds": list(options.seeds), **_mean_of(list(worlds.values()), kinds), "worlds": worlds}
     rows = {kind: row | {"kind": kind} for kind, row in found["kinds"].items()}
     title = f"Bad vehicles: {options.bad:.0%} of {options.vehicles}, honest F1 {found['honest']['f1']:.1f}"
-    return StudyReport(found, [sheet_of(title, _SHOWN, rows)], file="trust.json")
+    sheets = [sheet_of("Nobody is bad", _HONEST, {"all": found["honest"]})]
+    if rows:
+        sheets.append(sheet_of(title, _SHOWN, rows))
+    return StudyReport(found, sheets, file="trust.json")
 
 
 def run_kind(files: WorldFiles, vehicles: Sequence[VehicleFile], kind: str, share: float, seed: int) -> dict[str, Any]:
@@ -93,7 +111,8 @@ def run_kind(files: WorldFiles, vehicles: Sequence[VehicleFile], kind: str, shar
     honest = [[ChangeReport.decode(body) for body in one.read().reports] for one in vehicles[: _SMALL.get(kind)]]
     if kind == "honest":
         run = run_cloud(scorer.base, honest)
-        return {"f1": scorer.score(run.tiles).f1(), "honest_quarantined": len(run.quarantined), "honest": len(honest)}
+        names = {one.vehicle for reports in honest for one in reports}
+        return run.judgements(names) | {"f1": scorer.score(run.tiles).f1(), "honest": len(honest), "alone": run.alone}
     bad = bad_ones(len(honest), kind, share, seed)
     fleet, lies = list[Sequence[ChangeReport]](), list[list[ChangeReport]]()
     for number, reports in enumerate(honest):
@@ -138,8 +157,7 @@ def _row(
         "named": len(named),
         "named_after_tiles": median(dirty.named_after[one] for one in named) if named else None,
         "honest": n - len(bad),
-        "honest_quarantined": len(dirty.quarantined - bad),
-    }
+    } | dirty.judgements({one.vehicle for one in true})
 
 
 def false_published(
@@ -178,14 +196,15 @@ def _mean_of(worlds: Sequence[Mapping[str, Any]], kinds: Sequence[str]) -> dict[
     found: dict[str, Any] = {
         "honest": {
             "f1": float(np.mean([one["honest"]["f1"] for one in worlds])),
-            "honest_quarantined": sum(one["honest"]["honest_quarantined"] for one in worlds),
+            **{name: sum(one["honest"][name] for one in worlds) for name in ("honest", *_JUDGED)},
+            "alone": max(one["honest"]["alone"] for one in worlds),
         }
     }
     rows = {}
     for kind in kinds:
         of = [one[kind] for one in worlds]
         after = [one["named_after_tiles"] for one in of if one["named_after_tiles"] is not None]
-        counts = ("false_claims", "false_published", "bad", "named", "honest", "honest_quarantined")
+        counts = ("false_claims", "false_published", "bad", "named", "honest", *_JUDGED)
         sums = {name: sum(one[name] for one in of) for name in counts}
         rows[kind] = sums | {
             "f1": float(np.mean([one["f1"] for one in of])),

@@ -22,6 +22,7 @@ from suite_ports import new_port
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig, zenoh_config
+from gnd.fleet_bus.gate import FRESH_LOOKS, LOOK_S
 from gnd.fleet_bus.identity.authority import Authority
 from gnd.fleet_bus.identity.names import MemberName
 
@@ -103,6 +104,11 @@ def router_process(identity: Path, endpoint: str) -> Iterator["subprocess.Popen[
         process.wait(20)
         if process.stdout is not None:
             process.stdout.close()
+
+
+def be_settled() -> None:
+    """Waits until who is connected stays so when rights change; who has only just come, comes again."""
+    time.sleep((FRESH_LOOKS + 2) * LOOK_S)
 
 
 def until(condition: Callable[[], bool], timeout_s: float = START_S) -> bool:

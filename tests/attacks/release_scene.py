@@ -20,7 +20,7 @@ from gnd.schemas.health import HealthReport, TileHealth
 from gnd.schemas.keys import health_key
 from gnd.schemas.ticket import ticket_of
 from gnd.tile_client.exchange import Exchange, TilesInMemory
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.released import released
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.trials import Arm, TrialState, VersionTrial

@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 
-NOW = dt.datetime.now(dt.UTC)
+NOW = dt.datetime.now(dt.UTC)  # of the import: a whole suite may run for an hour before a test uses it
 HOUR = dt.timedelta(hours=1)
 
 
@@ -39,7 +39,7 @@ class Authority:
         name: str,
         *,
         begins: dt.datetime = NOW - HOUR,
-        ends: dt.datetime = NOW + HOUR,
+        ends: dt.datetime = NOW + 24 * HOUR,
         folder: str = "",
     ) -> Path:
         """An identity folder."""

@@ -3,8 +3,10 @@ bounded stays bounded.
 """
 
 import datetime as dt
+import itertools
 import json
 import os
+import random
 import signal
 import socket
 import ssl
@@ -13,36 +15,43 @@ import sys
 import threading
 import time
 import zlib
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
 from limits_scene import HONEST, Honest, flooding, store_bytes, wait_for
+from ulid import ULID
 
 from gnd.cloud_merger.admission import NONSENSE_AT_ONCE, REPORTS_AT_ONCE, WAITING_OF_ALL, WAITING_OF_VEHICLE
+from gnd.cloud_merger.features.kept import square
 from gnd.deploy.chaos.street import ChaosStreet, read_street
 from gnd.deploy.processes import ProcessSpec
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig, zenoh_config
 from gnd.fleet_bus.errors import Busy, RequestFailed
 from gnd.fleet_bus.guard import USUAL_LIMITS, ConnectionGuard
-from gnd.fleet_bus.requesting import LONGEST_BUSY_S
+from gnd.fleet_bus.requesting import COUNT_WANTED, LONGEST_BUSY_S
 from gnd.fleet_bus.router import open_router
+from gnd.fleet_bus.seals import MARK
 from gnd.fleet_bus.seldom import LINES_A_MINUTE, MAX_LINE_CHARACTERS
 from gnd.gnd_map.codec import Flags, encode_flags
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile_id import TileId
 from gnd.gnd_map.track import Track, TrackPiece, encode_track
+from gnd.schemas.changes import ChangeReport
 from gnd.schemas.generated import change_report_pb2
-from gnd.schemas.keys import ROOT, change_key, update_keys
+from gnd.schemas.keys import ROOT, change_key, health_key, tile_key, traffic_key, update_keys
 from gnd.schemas.packed import PackedGaussians, PackedReport, digest_of
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.tile_store.uploads import UploadStatus
+from studies.dearest import whole_report as dearest_report
 from studies.flooding import FLOODER, ghosts
 from studies.small_cloud import TILE, SmallCloud, base_tile, change_report, small_cloud
 
@@ -188,9 +197,9 @@ def resident_mb(pid: int) -> float:
 def heavy(street: ChaosStreet, tiles: int, pieces: int, top: int, far: int) -> tuple[str, PackedReport]:
     """A small report that costs much to understand: few flags over many tiles, floors and pieces of way."""
     district = street.copies[0][0].tile_id.district
-    told = []
-    for index in range(tiles):
-        tile_id = TileId(district.first_morton + index)
+    near = {one for tile in street.copies[0] for one in square(tile.tile_id, 3) if one.district == district}
+    chosen, told = sorted(near)[:tiles], []
+    for tile_id in chosen:
         grid = VoxelGrid.of(tile_id)
         ids = np.unique(grid.voxel_id(np.array([0, 1]), np.array([0, 1]), np.array([0, top]))).astype(np.int32)
         told.append(Flags(tile_id, Gaussians.empty(), ids, np.ones(len(ids), np.uint8)))
@@ -200,8 +209,8 @@ def heavy(street: ChaosStreet, tiles: int, pieces: int, top: int, far: int) -> t
         street.said(1, "x", 0).packed,
         report_id=deterministic_report_id(1_700_000_000_000, "heavy", str(tiles), str(pieces), str(top), str(far)),
         vehicle="heavy",
-        tiles=tuple((index, 0) for index in range(tiles)),
-        base_digest=digest_of([b""] * tiles),
+        tiles=tuple((tile_id.morton - district.first_morton, 0) for tile_id in chosen),
+        base_digest=digest_of([b""] * len(chosen)),
         flags=encode_flags(told),
         track=encode_track(Track(district, view, way)),
         doubts=(),
@@ -484,3 +493,300 @@ def test_attack_herd_after_a_restart(cloud, honest):
     assert len(answered) == 40
     assert max(answered) > min(answered)
     honest.is_served()
+
+
+# What zenoh itself lets anybody do
+
+
+@contextmanager
+def pestering(cloud: SmallCloud, attack: Callable[[zenoh.Session, int], object], most: int = 20_000) -> Iterator[None]:
+    """A session of an attacker does it again and again, as fast as it can, while the block runs."""
+    stop, begun = threading.Event(), threading.Event()
+
+    def run() -> None:
+        with zenoh.open(zenoh_config(BusConfig(connect=(cloud.connect,)))) as session:
+            for n in range(most):
+                if stop.is_set():
+                    return
+                attack(session, n)
+                if n == 20:
+                    begun.set()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        assert begun.wait(60.0)
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def asks(session: zenoh.Session, key: str, payload: bytes = b"", **options: Any) -> None:
+    """A question whose answer nobody reads."""
+    session.get(key, lambda _reply: None, **{"payload": payload, "timeout": 2.0} | options)
+
+
+def grown_mb(cloud: SmallCloud, before: dict[str, float]) -> float:
+    """How much the parts of the cloud have grown since, the most of one."""
+    return max(resident_mb(cloud.pid(name)) - before[name] for name in before)
+
+
+def sizes(cloud: SmallCloud) -> dict[str, float]:
+    return {name: resident_mb(cloud.pid(name)) for name in ("router", "store", "merger-0")}
+
+
+@pytest.mark.parametrize(
+    "key",
+    [f"{ROOT}/tile/ndt/**", f"{ROOT}/change/**", f"{ROOT}/state/*", f"{ROOT}/*/ndt/*/*", "**", f"{ROOT}/catalog/*/**"],
+)
+def test_attack_questions_with_wildcards(cloud, honest, key):
+    """Small questions about everything at once: one thread and 64 places for all of them."""
+    with pestering(cloud, lambda session, _n: asks(session, key)):
+        honest.is_served()
+
+
+def test_attack_huge_keys(cloud, honest):
+    """Each question has another key of 30,000 characters: nobody keeps them, not even to serve askers in turn."""
+    before = sizes(cloud)
+    kinds = itertools.cycle(("tile/ndt", "change/ndt", "state", "catalog/ndt"))
+    with pestering(cloud, lambda session, n: asks(session, f"{ROOT}/{next(kinds)}/{30_000 * 'x'}/{n}"), most=2_000):
+        honest.is_served()
+    assert grown_mb(cloud, before) < 300
+
+
+def test_attack_questions_that_wait_for_ever(cloud, honest):
+    """Questions with a timeout of years on keys that nobody serves, and on those of tiles: nothing piles up."""
+    keys = (f"{ROOT}/nobody/serves/this", tile_key("ndt", TILE))
+    with pestering(cloud, lambda session, n: asks(session, keys[n % 2], timeout=1e8), most=4_000):
+        honest.is_served()
+
+
+def test_attack_odd_attachments(cloud, honest):
+    """Attachments of 200 kB, of the form of seals, of what counts answers: not read where nobody needs them."""
+    odd = (bytes(200_000), MARK + bytes(100), MARK + random.Random(3).randbytes(50_000), COUNT_WANTED * 1000)
+    key = change_key("ndt", TILE.district)
+    with pestering(cloud, lambda session, n: asks(session, key, b"report", attachment=odd[n % len(odd)]), 1_500):
+        honest.is_served()
+
+
+def test_attack_in_the_lane_of_control(cloud, honest):
+    """1,500 messages in zenoh's most urgent lane, 100 kB each, as fast as they go: others are served all the same."""
+    key, body = change_key("ndt", TILE.district), bytes(100_000)
+    with pestering(cloud, lambda session, _n: asks(session, key, body, priority=zenoh.Priority.REAL_TIME), 1_500):
+        honest.is_served()
+
+
+def test_attack_subscribers_come_and_go(cloud, honest):
+    """Somebody subscribes to everything and leaves, again and again."""
+    with pestering(cloud, lambda session, _n: session.declare_subscriber("gnd/v1/**", lambda _: None).undeclare()):
+        honest.is_served()
+        cloud.publish(1)
+
+
+def test_attack_queryables_come_and_go(cloud, honest):
+    """Somebody offers to answer on thousands of keys, and takes it back."""
+
+    def offers(session: zenoh.Session, n: int) -> None:
+        session.declare_queryable(f"{ROOT}/tile/ndt/offered/{n}", lambda query: query.drop()).undeclare()
+
+    with pestering(cloud, offers):
+        honest.is_served()
+
+
+def test_attack_tokens_come_and_go(cloud, honest):
+    """Tokens of shards that do not exist, and with names as no shard has: nobody waits for one of them."""
+    names = itertools.cycle(("ghost", 300 * "g", "shard-1", "@", "shard-0"))
+
+    def appears(session: zenoh.Session, n: int) -> None:
+        session.liveliness().declare_token(f"{ROOT}/alive/merger/{next(names)}{n % 7}").undeclare()
+
+    with pestering(cloud, appears):
+        honest.is_served()
+
+
+def test_attack_sessions_come_and_go(cloud, honest):
+    """Sessions are opened and closed as fast as one can: the router takes others in meanwhile."""
+    stop, opened = threading.Event(), list[int]()
+
+    def comes_and_goes() -> None:
+        while not stop.is_set():
+            zenoh.open(zenoh_config(BusConfig(connect=(cloud.connect,)))).close()
+            opened.append(1)
+
+    threads = [threading.Thread(target=comes_and_goes) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    try:
+        wait_for(lambda: len(opened) > 20, "sessions have come and gone")
+        newcomer_is_served(cloud, honest)
+        honest.is_served()
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+def test_attack_puts_of_health_and_traffic(cloud, honest):
+    """Telemetry without end, and too large: the router lets none of the large in, and nobody waits for the small."""
+    before = sizes(cloud)
+    bodies = (bytes(4_000_000), random.Random(5).randbytes(16_000), b"")
+
+    def puts(session: zenoh.Session, n: int) -> None:
+        session.put((health_key, traffic_key)[n % 2](f"liar-{n}"), bodies[n % len(bodies)])
+
+    with pestering(cloud, puts, most=600):
+        honest.is_served()
+    assert grown_mb(cloud, before) < 300
+
+
+def test_attack_states_a_thousand_times_a_second(cloud, honest):
+    """A vehicle asks after 64 reports 1,000 times a second."""
+    with flooding(cloud, "states", 1000.0):
+        honest.hears(honest.reports())
+
+
+def test_attack_asker_that_does_not_read(cloud, honest):
+    """A program sends thousands of questions about a whole district and is stopped: its answers hold nobody up."""
+    code = (
+        "import sys\nfrom gnd.fleet_bus.bus import open_bus\nfrom gnd.fleet_bus.config import BusConfig\n"
+        "from studies.flooding import messages\nfrom gnd.gnd_map.tile_id import TileId\n"
+        "bus = open_bus(BusConfig(connect=(sys.argv[1],)))\nsource = messages('tiles', TileId(int(sys.argv[2])))\n"
+        "print('ready', flush=True)\n"
+        "for n in range(1_000_000):\n"
+        "    key, payload = next(source)\n"
+        "    bus.connection.session.get(key, lambda _reply: None, payload=payload, timeout=600.0)\n"
+    )
+    command = [sys.executable, "-c", code, cloud.connect, str(TILE.morton)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        time.sleep(0.5)
+        process.send_signal(signal.SIGSTOP)
+        honest.is_served()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+# Reports that are odd, and legal
+
+
+def sends(honest: Honest, report: ChangeReport, key: str = "") -> str:
+    """The status of its acknowledgement."""
+    return honest.send(key or change_key(report.layer, report.district), report.encode()).status
+
+
+def odd_report(number: int, vehicle: str, **changes: Any) -> ChangeReport:
+    report_id = deterministic_report_id(1_700_000_000_000 + number, "odd", vehicle, str(number))
+    return replace(change_report(number, base_tile()), report_id=report_id, vehicle=vehicle, **changes)
+
+
+def test_attack_stolen_report_ids(cloud, honest):
+    """Another vehicle has sent a report under each id that the honest one uses: both are kept, neither is lost."""
+    for number in range(5):
+        stolen = odd_report(number, "thief")
+        assert sends(honest, stolen) == "stored"
+        assert sends(honest, replace(stolen, vehicle=HONEST)) == "stored"
+        honest.hears(stolen.report_id)
+
+
+@pytest.mark.parametrize("skew_s", [1e9, 600.0, -1.7e9, -3600.0])
+def test_attack_wrong_clocks(cloud, honest, skew_s):
+    """Reports of the future are refused with the number, those of the past are taken; neither disturbs the others."""
+    last_ns = max(1, time.time_ns() + round(skew_s * 1e9))
+    for number in range(2 if skew_s > 0 else 5):
+        report = odd_report(number + round(abs(skew_s)) % 9_000, "clock", first_ns=last_ns - 1, last_ns=last_ns)
+        try:
+            status = sends(honest, report)
+        except RequestFailed:  # busy: so many that cannot be kept have been refused already
+            status = "quarantined"
+        assert status == ("quarantined" if skew_s > 300 else "stored")
+    honest.hears(honest.reports())
+
+
+def test_attack_one_voxel_in_each_of_many_tiles(cloud, honest):
+    """Reports about 1,024 tiles each, one voxel in each of them: most are not on the map, and the report is refused."""
+    one = base_tile().gaussians.take(np.arange(1))
+    (change,) = change_report(1, base_tile()).tiles
+    tiles = tuple(
+        replace(
+            change,
+            tile=TileId(TILE.district.first_morton + n),
+            base_version=0,
+            base_sha=b"",
+            observed=one.voxel_id,
+            changed=one,
+            change_class=change.change_class[:1],
+            evidence=change.evidence[:1],
+        )
+        for n in range(1024)
+    )
+    for number in range(10):
+        assert sends(honest, odd_report(number, "wide", tiles=tiles)) == "stored"
+    honest.hears(honest.reports())
+    wait_for(lambda: waiting(cloud, "wide") == 0, "all are looked at")
+    assert any("is not on the map" in one.reason for one in quarantined(cloud))
+
+
+def test_attack_layers_that_take_turns(cloud, honest):
+    """Each report is about another layer that no map has: none of them is merged, and no layer comes to be."""
+    for number in range(20):
+        layer = f"ndt_{number}"
+        assert sends(honest, odd_report(number, "layers", layer=layer)) == "stored"
+    honest.hears(honest.reports())
+    wait_for(lambda: waiting(cloud, "layers") == 0, "all are looked at")
+    assert not any(list(cloud.store.heads(f"ndt_{number}", TILE.district.path)) for number in range(20))
+
+
+def test_attack_halves_that_never_become_whole(cloud, honest, street):
+    """60 reports in short whose Gaussians never come: they wait for them, and nobody else does."""
+    for number in range(60):
+        one = street.said(9, "half", number)
+        assert honest.send(one.key, one.packed.encode()).status in ("stored", "duplicate")
+    honest.hears(honest.reports())
+
+
+def test_attack_flags_and_gaussians_of_nobody_in_turn(cloud, honest, street):
+    """Gaussians that nobody asked for, under the ids of flags that came: refused, and the flags stay as they were."""
+    for number in range(20):
+        one = street.said(10, "mixed", number)
+        assert honest.send(one.key, one.packed.encode()).status in ("stored", "duplicate")
+        body = PackedGaussians(one.packed.report_id, bytes(400), 7).encode()
+        assert honest.send(one.key, body).status in ("stored", "duplicate")
+    honest.hears(honest.reports())
+    ids = [street.said(10, "mixed", number).packed.report_id for number in range(20)]
+
+    def states() -> set[str]:
+        return {one.state for one in cloud.store.upload_statuses("mixed", ids)}
+
+    wait_for(lambda: "waiting" not in states(), "both halves of all are looked at")
+    assert states() <= {"wanted", "released", "resend"}
+
+
+@pytest.mark.parametrize("field", ["flags", "track", "base_digest", "sensor_model", "software"])
+def test_attack_garbage_that_unpacks(cloud, honest, street, field):
+    """Each part of a report in short holds what unpacks to far more than it is: refused for what it costs or says."""
+    packed = street.said(1, "garbage", 0).packed
+    fillings = bytes(300_000), zlib.compress(bytes(50_000_000), 9), 100_000 * b"\x28\xb5\x2f\xfd"
+    for number, filling in enumerate(fillings):
+        message = change_report_pb2.ChangeReport.FromString(packed.encode())
+        is_text = isinstance(getattr(message.packed, field), str)
+        setattr(message.packed, field, filling.decode("latin-1") if is_text else filling)
+        report_id = deterministic_report_id(1_700_000_000_000 + number, "garbage", field)
+        message.packed.report_id = ULID.from_str(report_id).bytes
+        ack = honest.send(street.said(1, "garbage", 0).key, message.SerializeToString())
+        assert ack.status in ("stored", "quarantined", "duplicate")
+    honest.hears(honest.reports())
+    wait_for(lambda: waiting(cloud, "garbage") == 0, "all are looked at")
+    assert resident_mb(cloud.pid("merger-0")) < 1500
+
+
+def test_attack_reports_as_expensive_as_they_may_be(cloud, honest):
+    """A vehicle sends the dearest reports that are taken: those of others are looked at in between."""
+    sizes = {"tiles": 8, "changed": 20_000, "observed": 80_000, "top": 400, "held": 1}
+    for _ in range(30):
+        assert honest.send(*dearest_report(sizes)).status == "stored"
+    honest.hears(honest.reports())
+    wait_for(lambda: waiting(cloud, "dear") == 0, "all are looked at")

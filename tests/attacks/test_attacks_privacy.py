@@ -32,6 +32,7 @@ from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.schemas.keys import traffic_keys
 from gnd.schemas.traffic import TrafficSample
 from gnd.tile_store.build import build_map
+from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.config import PRIVATE_OFF, PRIVATE_SEEN_M
 from gnd.vehicle_agent.surroundings import tile_distance_m
@@ -112,7 +113,7 @@ def trips(tmp_path_factory: pytest.TempPathFactory) -> Trips:
         authority.issue(MemberName.parse(member), folder / name)
     authority.copy_lists([folder / "router"])
     made = Trips(folder, authority)
-    with SqliteStore(made.store) as store:
+    with SqliteStore(made.store, signing=Signing(folder / "o")) as store:
         build_map([folder / "map.mcap"], store)
     endpoint = f"tls/127.0.0.1:{new_port()}"
     issue(made)

@@ -17,7 +17,7 @@ from gnd.schemas.generated import health_report_pb2, tile_health_pb2
 from gnd.schemas.health import HealthReport
 from gnd.schemas.tiles_batch import HeldVersion, TilesReply, TilesRequest
 from gnd.tile_store import clocks
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 
 BADLY, WELL = [400, 410, 390, 405, 395, 402, 398, 401], [785 + k for k in range(9)]
 

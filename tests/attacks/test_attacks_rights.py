@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import zenoh
-from identity_scene import Scene, scene, until
+from identity_scene import Scene, be_settled, scene, until
 
 from gnd.fleet_bus.identity.names import MemberName
 
@@ -29,7 +29,8 @@ ALIVE_A, ALIVE_B, ALIVE_SHARD, ALIVE_OTHER, ALIVE_STORE, ALIVE_STORE_2 = (
     f"{V1}/alive/{one}"
     for one in ("agent/a", "agent/b", "merger/shard-0", "merger/shard-1", "store/store", "store/store-2")
 )
-LISTS = {f"{V1}/authority/members", f"{V1}/authority/revoked"}
+REVOKED = f"{V1}/authority/revoked"
+LISTS = {f"{V1}/authority/members", REVOKED}
 MAP = {TILE, TILES, CATALOG}
 TOKENS = {ALIVE_A, ALIVE_B, ALIVE_SHARD, ALIVE_OTHER, ALIVE_STORE, ALIVE_STORE_2}
 KEYS = {*MAP, CHANGE, UPDATE, *OF_A.values(), *OF_B.values(), *TOKENS, *LISTS, f"{V1}/else", "gnd/v2/tile", "other/key"}
@@ -56,10 +57,10 @@ PUTS = {
     "operator": LISTS,
 }
 HEARS = {
-    "vehicle": {UPDATE, OF_A["want"], OF_A["live"]},
+    "vehicle": {UPDATE, OF_A["want"], OF_A["live"], REVOKED},
     "shard": LISTS,
     "tiles": LISTS,
-    "operator": {UPDATE, OF_A["traffic"], OF_B["traffic"]},
+    "operator": {UPDATE, OF_A["traffic"], OF_B["traffic"], REVOKED},
 }
 ASKS = {"vehicle": {*MAP, CHANGE, OF_A["state"], OF_A["live"]}, "shard": set(), "tiles": set(), "operator": MAP}
 ANSWERS = {
@@ -232,6 +233,7 @@ def test_a_new_member_gets_in_without_a_restart(place: Scene) -> None:
     """A vehicle whose certificate is new has its rights within seconds, and who was connected stays connected."""
     with place.bus("shard.shard-0") as shard, place.bus("vehicle.b") as other:
         shard.serve(f"{V1}/state/*", lambda request: request.key.encode())
+        be_settled()
         connections = shard.connections, other.connections
         folder = place.issue("vehicle.new")
         with place.bus(folder) as new:

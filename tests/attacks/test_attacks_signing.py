@@ -5,7 +5,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -14,13 +14,17 @@ from signing_scene import HOUR, NOW, Authority
 from suite_ports import new_port
 
 from gnd.fleet_bus import seals
+from gnd.fleet_bus.agreed_keys import KEYS_A_MEMBER, REPLAY_WINDOW, AgreedKey, GrantedKeys, KeyHalf
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig, zenoh_config
 from gnd.fleet_bus.errors import IdentityError, Refused, RequestFailed, RequestRefused, SealError
-from gnd.fleet_bus.requesting import END_OF_ANSWERS, REFUSED, RetryPolicy
+from gnd.fleet_bus.remembered import FILE
+from gnd.fleet_bus.requesting import END_OF_ANSWERS, REFUSED, SIGNATURE_WANTED, RetryPolicy
 from gnd.fleet_bus.router import open_router
 from gnd.fleet_bus.seal_keys import load_signer
+from gnd.fleet_bus.sealing import HeardQuestion, SealedQuestion, Sealing, SignatureWanted
 from gnd.fleet_bus.serving import Request
+from gnd.fleet_bus.short_seals import ShortSeal
 
 TILES = "gnd/v1/tiles/ndt/13033/03021/12301"
 OTHER_TILES = "gnd/v1/tiles/ndt/13033/03021/12302"
@@ -241,15 +245,15 @@ def test_attack_answer_of_yesterday(scene: Scene) -> None:
 def a_question(scene: Scene, key: str, payload: bytes) -> bytes:
     sealing = scene.vehicle.connection.sealing
     assert sealing is not None
-    return sealing.question(key, payload, count_wanted=False, with_chain=False).attachment
+    return sealing.question(key, payload, count_wanted=False, with_chain=False, short=False).attachment
 
 
 def checked(scene: Scene, key: str, payload: bytes, seal: seals.Seal) -> None:
     """As the vehicle checks an answer to a question that it asks now."""
     sealing = scene.vehicle.connection.sealing
     assert sealing is not None
-    asked = sealing.question(key, b"which", count_wanted=False, with_chain=False)
-    sealing.check_answer(key, key, payload, seal.encode(), asked.digest)
+    asked = sealing.question(key, b"which", count_wanted=False, with_chain=False, short=False)
+    sealing.check_answer(key, key, payload, seal.encode(), asked)
 
 
 def test_attack_answer_of_another_district(scene: Scene) -> None:
@@ -258,9 +262,9 @@ def test_attack_answer_of_another_district(scene: Scene) -> None:
     assert sealing is not None
 
     def swap(query: zenoh.Query) -> None:
-        asked = seals.nonce_of(query.attachment.to_bytes() if query.attachment else b"")
-        digest = seals.question_digest(OTHER_TILES, b"which", asked)
-        query.reply(TILES, b"other", attachment=sealing.answer(OTHER_TILES, b"other", digest))
+        asked = seals.number_of(query.attachment.to_bytes() if query.attachment else b"")
+        heard = HeardQuestion(None, seals.question_digest(OTHER_TILES, b"which", asked))
+        query.reply(TILES, b"other", attachment=sealing.answer(OTHER_TILES, b"other", heard))
 
     fake = impostor(scene, TILES, swap)
     try:
@@ -276,8 +280,8 @@ def test_attack_altered_answer(scene: Scene) -> None:
 
     def alter(query: zenoh.Query) -> None:
         asked = query.attachment.to_bytes() if query.attachment else b""
-        digest = seals.question_digest(TILES, b"which", seals.nonce_of(asked))
-        query.reply(TILES, b"tree", attachment=sealing.answer(TILES, b"true", digest))
+        heard = HeardQuestion(None, seals.question_digest(TILES, b"which", seals.number_of(asked)))
+        query.reply(TILES, b"tree", attachment=sealing.answer(TILES, b"true", heard))
 
     fake = impostor(scene, TILES, alter)
     try:
@@ -291,7 +295,7 @@ def test_attack_stripped_seal(scene: Scene) -> None:
     sealing = scene.vehicle.connection.sealing
     assert sealing is not None
     with pytest.raises(SealError, match="no seal"):
-        sealing.check_answer(TILES, TILES, b"true", b"", b"")
+        sealing.check_answer(TILES, TILES, b"true", b"", SealedQuestion(b"", b""))
 
 
 @pytest.mark.parametrize("role", ["vehicle", "shard", "operator"])
@@ -343,13 +347,17 @@ def test_attack_invented_certificates(scene: Scene) -> None:
     """A stranger seals with thousands of invented certificates; after a few, none is asked for any more."""
     sealing = scene.vehicle.connection.sealing
     assert sealing is not None
-    for number in range(2000):
-        seal = seals.Seal("notice", number.to_bytes(8, "big"), 0, bytes(64))
-        sealing._in_vain.setdefault(number.to_bytes(8, "big"), time.monotonic() + 0.2) if number < 16 else None
-        with pytest.raises(SealError, match=r"not known|nobody shows"):
-            sealing.check_notice(UPDATE, b"x", seal.encode())
-    assert len(sealing._in_vain) <= 17
-    time.sleep(0.3)
+    sealing._in_vain.clear()
+    for number in range(16):
+        sealing._in_vain[number.to_bytes(8, "big")] = time.monotonic() + 60.0
+    try:
+        for number in range(2000):
+            seal = seals.Seal("notice", number.to_bytes(8, "big"), 0, bytes(64))
+            with pytest.raises(SealError, match=r"not known|nobody shows"):
+                sealing.check_notice(UPDATE, b"x", seal.encode())
+        assert len(sealing._in_vain) == 16
+    finally:
+        sealing._in_vain.clear()
 
 
 # ---- notices
@@ -402,7 +410,7 @@ def test_attack_answer_used_as_notice(scene: Scene) -> None:
     vehicle = scene.vehicle.connection.sealing
     assert vehicle is not None
     with pytest.raises(SealError, match=r"seal of a answer on a notice|seal of an answer"):
-        vehicle.check_notice(UPDATE, b"x", sealing.answer(UPDATE, b"x", b""))
+        vehicle.check_notice(UPDATE, b"x", sealing.answer(UPDATE, b"x", HeardQuestion(None, b"")))
 
 
 # ---- reports
@@ -422,7 +430,7 @@ def test_attack_report_repeated_by_a_listener(scene: Scene) -> None:
     scene.report(b"first")  # the shard knows the certificate from now on
     while not scene.change.none():
         scene.change.requests.get()
-    attachment = sealing.question(CHANGE, b"kept", count_wanted=False, with_chain=False).attachment
+    attachment = sealing.question(CHANGE, b"kept", count_wanted=False, with_chain=False, short=False).attachment
     for expected in (1, 0, 0):
         list(scene.stranger.get(CHANGE, payload=b"kept", attachment=attachment))
         heard = 0
@@ -441,7 +449,7 @@ def test_attack_report_kept_for_long(scene: Scene, monkeypatch: pytest.MonkeyPat
     for moved_s in (-86_400, 86_400):
         now_ns = time.time_ns()
         monkeypatch.setattr(seals.time, "time_ns", lambda moved_s=moved_s, now_ns=now_ns: now_ns + moved_s * 10**9)
-        kept = sealing.question(CHANGE, b"kept", count_wanted=False, with_chain=True).attachment
+        kept = sealing.question(CHANGE, b"kept", count_wanted=False, with_chain=True, short=False).attachment
         monkeypatch.undo()
         with pytest.raises(SealError, match="check the vehicle's clock"):
             shard.check_question(CHANGE, b"kept", kept)
@@ -454,7 +462,7 @@ def test_attack_altered_report(scene: Scene, what: str) -> None:
     shard = scene.shard.connection.sealing
     assert sealing is not None
     assert shard is not None
-    attachment = sealing.question(CHANGE, b"report", count_wanted=False, with_chain=True).attachment
+    attachment = sealing.question(CHANGE, b"report", count_wanted=False, with_chain=True, short=False).attachment
     key, body = CHANGE, b"report"
     if what == "body":
         body = b"repost"
@@ -489,7 +497,7 @@ def test_attack_state_of_another_vehicle(scene: Scene) -> None:
     ("begins", "ends", "why"),
     [
         (NOW - 3 * HOUR, NOW - HOUR, "has ended"),
-        (NOW + HOUR, NOW + 2 * HOUR, "not valid yet"),
+        (NOW + 10 * HOUR, NOW + 11 * HOUR, "not valid yet"),
     ],
 )
 def test_attack_certificate_out_of_time(scene: Scene, begins: dt.datetime, ends: dt.datetime, why: str) -> None:
@@ -582,3 +590,399 @@ def test_many_threads_seal_and_check(scene: Scene) -> None:
     for thread in threads:
         thread.join()
     assert done == [b"true"] * 40
+
+
+# ---- keys that two parts have agreed on
+
+
+def agreed_of(sealing: Sealing, key: str) -> AgreedKey:
+    """The key with which the vehicle asks on `key`."""
+    found = sealing._held.to_use(key, seals.ANSWERED_BY[key.split("/")[2]])
+    assert found is not None, f"no key for {key}"
+    return found
+
+
+@pytest.fixture
+def sealings(scene: Scene) -> tuple[Sealing, Sealing, Sealing]:
+    """Of the vehicle, the shard and the tile server; the vehicle has agreed on a key with both, and used it."""
+    vehicle, shard, tiles = (bus.connection.sealing for bus in (scene.vehicle, scene.shard, scene.tiles))
+    assert vehicle is not None
+    assert shard is not None
+    assert tiles is not None
+    vehicle._held.clear()
+    for _ in range(2):
+        scene.report()
+        scene.ask()
+    while not scene.change.none():
+        scene.change.requests.get()
+    return vehicle, shard, tiles
+
+
+def short_question(vehicle: Sealing, key: str = CHANGE, payload: bytes = b"report") -> SealedQuestion:
+    asked = vehicle.question(key, payload, count_wanted=False, with_chain=False)
+    assert asked.agreed is not None
+    return asked
+
+
+def test_parts_agree_on_a_key_and_use_it(scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    vehicle, shard, tiles = sealings
+    asked = short_question(vehicle)
+    assert len(asked.attachment) <= 14
+    heard = shard.check_question(CHANGE, b"report", asked.attachment)
+    assert heard.asker is not None
+    assert (heard.asker.role, heard.asker.name) == ("vehicle", "v1")
+    answer = shard.answer(CHANGE, b"true", heard)
+    assert len(answer) == 9
+    assert vehicle.check_answer(CHANGE, CHANGE, b"true", answer, asked) is False
+    refusal = shard.answer(CHANGE, b"no", heard, refusal=True)
+    assert vehicle.check_answer(CHANGE, CHANGE, b"no", refusal, asked) is True
+    bare = short_question(vehicle, TILES, b"which")
+    assert len(bare.attachment) <= 10
+    assert tiles.check_question(TILES, b"which", bare.attachment).asker is None
+    heard_of: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    with scene.vehicle.subscribe(WANT, lambda _, payload: heard_of.put(payload)):
+        time.sleep(0.3)
+        assert len(shard.notice(WANT, b"x")) <= 13
+        scene.shard.publish(WANT, b"released", kind="ack")
+        assert heard_of.get(timeout=10) == b"released"
+    with pytest.raises(RequestRefused, match="no such question"):
+        scene.vehicle.request(CATALOG, b"nonsense", kind="catalog", timeout_s=5.0)
+    with pytest.raises(RequestRefused, match="no such question"):  # in short, too
+        scene.vehicle.request(CATALOG, b"nonsense", kind="catalog", timeout_s=5.0)
+
+
+def test_a_part_that_has_forgotten_its_keys_is_asked_with_a_signature(
+    scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]
+) -> None:
+    """A shard or a tile server was started again: no report is lost, and a new key is there after one question."""
+    vehicle, shard, tiles = sealings
+    for _ in range(3):
+        shard._granted.clear()
+        tiles._granted.clear()
+        before = agreed_of(vehicle, CHANGE)
+        assert scene.report() == b"true"
+        assert scene.ask() == b"true"
+        assert agreed_of(vehicle, CHANGE).key_id != before.key_id
+        assert len(short_question(vehicle).attachment) <= 14
+    asker = scene.change.requests.get(timeout=5).asker
+    assert asker is not None
+    assert asker.name == "v1"
+
+
+def test_a_part_is_killed_and_another_one_answers(scene: Scene) -> None:
+    """Two parts take turns on the same keys; each has a key of its own, and who is new is asked with a number or a
+    signature."""
+    key = "gnd/v1/tile/ndt/13033/03021/12399/00000"
+    folders = [scene.authority.part("tiles", f"turn{n}") for n in range(2)]
+    with scene.join(scene.authority.part("vehicle", "turns")) as vehicle:
+        for folder in (folders[0], folders[1], folders[0]):
+            heard = Heard()
+            with scene.join(folder) as part, part.serve(key, heard, complete=True, kind="tile"):
+                for n in range(3):
+                    payload = f"{folder.name} {n}".encode()
+                    assert vehicle.request(key, payload, kind="tile", retry=SOON) == b"true"
+                    assert heard.requests.get(timeout=5).payload == payload
+
+
+def test_attack_short_report_repeated(scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A listener sends a report with a short seal again: its number was used, so it is not even looked at."""
+    attachment = short_question(sealings[0], payload=b"kept").attachment
+    for expected in (1, 0, 0):
+        list(scene.stranger.get(CHANGE, payload=b"kept", attachment=attachment))
+        heard = 0
+        while not scene.change.none():
+            scene.change.requests.get()
+            heard += 1
+        assert heard == expected
+
+
+@pytest.mark.parametrize("late", [1, 500, 5000])
+def test_attack_counter_goes_back(sealings: tuple[Sealing, Sealing, Sealing], late: int) -> None:
+    """A report is held back and given when many later ones have passed, twice: it counts once, or not at all."""
+    vehicle, shard, _ = sealings
+    kept = short_question(vehicle).attachment
+    agreed = agreed_of(vehicle, CHANGE)
+    agreed._asked += late - 1
+    shard.check_question(CHANGE, b"report", short_question(vehicle).attachment)
+    if late < REPLAY_WINDOW:
+        shard.check_question(CHANGE, b"report", kept)
+    with pytest.raises(SignatureWanted, match="used before"):
+        shard.check_question(CHANGE, b"report", kept)
+
+
+@pytest.mark.parametrize("what", ["body", "key", "count", "key id", "proof", "mark"])
+def test_attack_altered_short_report(sealings: tuple[Sealing, Sealing, Sealing], what: str) -> None:
+    """A router alters anything of a report with a short seal; it does not fit, and a signature is asked for."""
+    vehicle, shard, _ = sealings
+    key, body, seal = CHANGE, b"report", ShortSeal.decode(short_question(vehicle).attachment)
+    if what == "body":
+        body = b"repost"
+    elif what == "key":
+        key = CHANGE.replace("12301", "12302")
+    elif what == "count":
+        seal = replace(seal, count=seal.count + 1)
+    elif what == "key id":
+        seal = replace(seal, key_id=bytes(3))
+    elif what == "proof":
+        seal = replace(seal, mac=bytes([seal.mac[0] ^ 1]) + seal.mac[1:])
+    else:
+        seal = replace(seal, what="notice")
+    with pytest.raises(SignatureWanted):
+        shard.check_question(key, body, seal.encode())
+
+
+def test_attack_short_proof_is_cut(sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """The proof of a report is cut to the 4 bytes that do for a question about the map, or to any other length."""
+    vehicle, shard, tiles = sealings
+    whole = short_question(vehicle).attachment
+    for size in range(len(whole)):
+        with pytest.raises(SealError):
+            shard.check_question(CHANGE, b"report", whole[:size])
+    bare = short_question(vehicle, TILES, b"which").attachment
+    for size in range(1, len(bare)):
+        with pytest.raises(SealError):
+            tiles.check_question(TILES, b"which", bare[:size])
+
+
+def test_attack_short_seal_of_the_map_on_a_report(sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A key that was agreed on without a name (a question about the map) is used to report; it names nobody."""
+    vehicle, _, tiles = sealings
+    agreed = agreed_of(vehicle, TILES)
+    seal = agreed.question(CHANGE, b"report", is_bare=False)
+    with pytest.raises(SignatureWanted, match="not known here"):
+        tiles.check_question(CHANGE, b"report", seal.encode())
+
+
+def test_attack_short_seal_taken_to_another_part(scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """What was sealed for one shard is given to another: each has keys of its own."""
+    attachment = short_question(sealings[0]).attachment
+    with scene.join(scene.authority.part("shard", "elsewhere")) as other:
+        sealing = other.connection.sealing
+        assert sealing is not None
+        with pytest.raises(SignatureWanted, match="not known here"):
+            sealing.check_question(CHANGE, b"report", attachment)
+
+
+def test_attack_short_seal_of_another_vehicle(scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A vehicle with a key of its own seals under another's key id, and asks after the other's reports."""
+    vehicle, shard, _ = sealings
+    with scene.join(scene.authority.part("vehicle", "thief-of-keys")) as thief:
+        for _ in range(2):
+            scene.report(b"own", thief)
+        own = thief.connection.sealing
+        assert own is not None
+        stolen = ShortSeal.decode(short_question(vehicle).attachment)
+        made = replace(agreed_of(own, CHANGE).question(CHANGE, b"report", is_bare=False), key_id=stolen.key_id)
+        with pytest.raises(SignatureWanted, match="does not fit"):
+            shard.check_question(CHANGE, b"report", made.encode())
+        own._held.answered(STATE, agreed_of(own, CHANGE).other)  # type: ignore[arg-type]
+        asked = short_question(own, STATE, b"?")
+        with pytest.raises(SignatureWanted, match="speaks on the key of v1"):
+            shard.check_question(STATE, b"?", asked.attachment)
+        with pytest.raises(RequestRefused, match="speaks on the key of v1"):
+            thief.request(STATE, b"?", kind="change", retry=SOON, timeout_s=5.0)
+
+
+def test_attack_answer_under_the_key_for_another_question(sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A true short answer is given to the next question, to one of another district, or on another key."""
+    vehicle, _, tiles = sealings
+    first = short_question(vehicle, TILES, b"which")
+    answer = tiles.answer(TILES, b"true", tiles.check_question(TILES, b"which", first.attachment))
+    again, other = short_question(vehicle, TILES, b"which"), short_question(vehicle, OTHER_TILES, b"which")
+    for asked, sealed, key in ((TILES, again, TILES), (OTHER_TILES, other, OTHER_TILES), (TILES, first, OTHER_TILES)):
+        with pytest.raises(SealError, match="does not fit"):
+            vehicle.check_answer(asked, key, b"true", answer, sealed)
+    assert vehicle.check_answer(TILES, TILES, b"true", answer, first) is False
+
+
+def test_attack_answer_asked_for_in_advance(scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A stranger foresees the vehicle's next question, number included, and asks it to keep the answer for later."""
+    vehicle, _, tiles = sealings
+    seal = ShortSeal.decode(short_question(vehicle, TILES, b"which").attachment)
+    for guess in (bytes(4), seal.mac):
+        foreseen = replace(seal, count=seal.count + 1, mac=guess)
+        replies = list(scene.stranger.get(TILES, payload=b"which", attachment=foreseen.encode()))
+        assert [str(reply.err.encoding) for reply in replies if reply.err is not None] == [SIGNATURE_WANTED]
+        with pytest.raises(SignatureWanted, match="does not fit"):
+            tiles.check_question(TILES, b"which", foreseen.encode())
+
+
+def test_attack_reflected_seal(sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A vehicle's own question comes back to it as an answer, or as a notice; each direction has its own key."""
+    vehicle, _, _ = sealings
+    asked = short_question(vehicle)
+    seal = ShortSeal.decode(asked.attachment)
+    with pytest.raises(SealError, match="does not fit"):
+        vehicle.check_answer(CHANGE, CHANGE, b"report", ShortSeal("answer", seal.mac).encode(), asked)
+    with pytest.raises(SealError, match="does not fit"):
+        vehicle.check_notice(WANT, b"report", replace(seal, what="notice").encode())
+    with pytest.raises(SealError, match="short seal of a question"):
+        vehicle.check_notice(WANT, b"report", asked.attachment)
+
+
+def test_attack_short_notice_repeated_or_on_another_key(sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A notice to one vehicle is repeated, moved to another key, or used as one for everybody."""
+    vehicle, shard, _ = sealings
+    notice = shard.notice(WANT, b"released")
+    vehicle.check_notice(WANT, b"released", notice)
+    with pytest.raises(SealError, match="used before"):
+        vehicle.check_notice(WANT, b"released", notice)
+    with pytest.raises(SealError, match="does not fit"):
+        vehicle.check_notice(WANT.replace("v1", "v2"), b"released", shard.notice(WANT, b"released"))
+    with pytest.raises(SealError, match="short seal of a notice"):
+        vehicle.check_notice(UPDATE, b"released", shard.notice(WANT, b"released"))
+
+
+def test_attack_other_half_of_a_key_is_swapped(sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """Somebody between the two puts in a half of his own, in the question or in the answer; neither is believed."""
+    vehicle, shard, tiles = sealings
+    for keys in (vehicle._held, shard._granted, tiles._granted):
+        keys.clear()
+    own = KeyHalf.make()
+    report = vehicle.question(CHANGE, b"report", count_wanted=False, with_chain=True)
+    swapped = replace(seals.Seal.decode(report.attachment), share=own.share)
+    with pytest.raises(SealError, match="does not fit"):
+        shard.check_question(CHANGE, b"report", swapped.encode())
+    asked = vehicle.question(TILES, b"which", count_wanted=False, with_chain=False)
+    swapped = replace(seals.Seal.decode(asked.attachment), share=own.share)
+    answer = tiles.answer(TILES, b"true", tiles.check_question(TILES, b"which", swapped.encode()))
+    with pytest.raises(SealError, match="does not fit"):
+        vehicle.check_answer(TILES, TILES, b"true", answer, asked)
+    answer = tiles.answer(TILES, b"true", tiles.check_question(TILES, b"which", asked.attachment))
+    for share in (own.share, bytes(32), b""):
+        with pytest.raises(SealError, match="does not fit"):
+            vehicle.check_answer(TILES, TILES, b"true", replace(seals.Seal.decode(answer), share=share).encode(), asked)
+    assert vehicle._held.to_use(TILES, "tiles") is None
+
+
+def test_attack_half_of_a_key_that_is_none(scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A half of a key from which everybody knows what follows (zero) is offered: answered, and no key comes of it."""
+    _, _, tiles = sealings
+    for half in (bytes(32), b"\x01" + bytes(31)):
+        asked = seals.Seal("number", b"", 0, b"", bytes(8), share=half)
+        replies = [reply.ok for reply in scene.stranger.get(TILES, payload=b"which", attachment=asked.encode())]
+        assert replies[0] is not None
+        assert replies[0].attachment is not None
+        assert seals.Seal.decode(replies[0].attachment.to_bytes()).share == b""
+    assert tiles.check_question(TILES, b"which", asked.encode()).share == half
+
+
+def test_attack_part_agrees_on_a_key_in_another_role(scene: Scene) -> None:
+    """A vehicle answers for the tile server and offers half of a key; the role in its certificate decides."""
+    key = "gnd/v1/tile/ndt/13033/03021/12377/00000"
+    with (
+        scene.join(scene.authority.part("vehicle", "agrees")) as other,
+        other.serve(key, lambda _: b"poison", complete=True, kind="tile"),
+        pytest.raises(RequestFailed, match=r"vehicle agrees has sealed|not known|nobody serves"),
+    ):
+        scene.vehicle.request(key, b"which", kind="tile", timeout_s=2.0, retry=SOON)
+    sealing = scene.vehicle.connection.sealing
+    assert sealing is not None
+    assert all(one.other is not None and one.other.role != "vehicle" for one in sealing._held._of_part.values())
+
+
+def test_attack_key_of_a_revoked_vehicle(scene: Scene) -> None:
+    """A vehicle has a key with the shard and is revoked: within two seconds its short seals do not count either."""
+    folder = scene.authority.part("vehicle", "revoked-with-key")
+    with scene.join(folder) as bad:
+        for _ in range(2):
+            assert scene.report(b"still good", bad) == b"true"
+        sealing, shard = bad.connection.sealing, scene.shard.connection.sealing
+        assert sealing is not None
+        assert shard is not None
+        asked = short_question(sealing, payload=b"too late")
+        scene.authority.revoke(folder, scene.authority.folder / "shard.s1")
+        time.sleep(1.2)
+        with pytest.raises(SignatureWanted, match="was revoked"):
+            shard.check_question(CHANGE, b"too late", asked.attachment)
+        with pytest.raises(RequestRefused, match="was revoked"):
+            scene.report(b"too late", bad)
+        assert shard.notice("gnd/v1/want/revoked-with-key", b"x").startswith(seals.MARK)  # no key is used any more
+    assert scene.report() == b"true"
+
+
+def test_attack_key_of_a_revoked_part(scene: Scene) -> None:
+    """A tile server is revoked that a vehicle has a key with: its short answers are dropped at once."""
+    key = "gnd/v1/tile/ndt/13033/03021/12388/00000"
+    tiles, own = scene.authority.part("tiles", "revoked-tiles"), scene.authority.part("vehicle", "asks-revoked")
+    with scene.join(own) as vehicle, scene.join(tiles) as bad, bad.serve(key, lambda _: b"true", complete=True):
+        for _ in range(2):
+            assert vehicle.request(key, b"which", kind="tile", retry=SOON) == b"true"
+        scene.authority.revoke(tiles, own)
+        time.sleep(1.2)
+        with pytest.raises(RequestFailed, match="was revoked"):
+            vehicle.request(key, b"which", kind="tile", retry=SOON, timeout_s=2.0)
+
+
+def test_attack_downgrade(scene: Scene, sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """A stranger says "sign it" to each question: signatures are stronger, so all that he gets are more bytes."""
+    vehicle, _, _ = sealings
+    fake = impostor(scene, "gnd/v1/change/**", lambda query: query.reply_err(b"", encoding=SIGNATURE_WANTED))
+    try:
+        assert [scene.report(f"report {n}".encode()) for n in range(5)] == [b"true"] * 5
+    finally:
+        fake.undeclare()
+    signed = scene.tiles.connection.sealing.answer(TILES, b"true", HeardQuestion(None, bytes(32)))  # type: ignore[union-attr]
+    with pytest.raises(SealError, match="no short seal"):  # a short question takes a short answer
+        vehicle.check_answer(TILES, TILES, b"true", signed, short_question(vehicle, TILES, b"which"))
+
+
+def test_attack_keys_of_invented_askers(sealings: tuple[Sealing, Sealing, Sealing]) -> None:
+    """Strangers agree on keys by the thousand: those with members stay, and memory is bounded."""
+    vehicle, shard, _ = sealings
+    granted = GrantedKeys()
+    for number in range(200):
+        granted.grant(KeyHalf.make().share, number.to_bytes(32, "big"), shard.own, None)
+        granted.grant(KeyHalf.make().share, number.to_bytes(32, "big"), shard.own, vehicle.own)
+    assert len(granted._unnamed) <= 200
+    assert len(granted._named) == KEYS_A_MEMBER
+    assert list(granted._of_name) == ["v1"]
+
+
+def test_renewed_certificates_bring_new_keys(scene: Scene) -> None:
+    folder = scene.authority.part("vehicle", "renews")
+    with scene.join(folder) as bus:
+        for _ in range(2):
+            scene.report(b"x", bus)
+        sealing = bus.connection.sealing
+        assert sealing is not None
+        before = agreed_of(sealing, CHANGE)
+        renewed = scene.authority.part("vehicle", "renews", folder="renews-again")
+        for name in ("certificate.pem", "key.pem"):
+            (folder / name).write_bytes((renewed / name).read_bytes())
+        sealing.renew(folder)
+        assert scene.report(b"x", bus) == b"true"
+        assert agreed_of(sealing, CHANGE).key_id != before.key_id
+
+
+# ---- certificates that an earlier start has learnt
+
+
+def test_a_new_start_knows_the_certificates(scene: Scene) -> None:
+    folder = scene.authority.part("vehicle", "starts-again")
+    for expected in (True, False):
+        with scene.join(folder) as bus:
+            asked: list[str] = []
+            sealing = bus.connection.sealing
+            assert sealing is not None
+            fetch = sealing.fetch
+            assert fetch is not None
+            sealing.fetch = lambda key, fetch=fetch, asked=asked: asked.append(key) or fetch(key)  # type: ignore[misc]
+            assert bus.request(TILES, b"which", kind="tile", retry=SOON) == b"true"
+            assert bool(asked) is expected
+
+
+def test_attack_foreign_certificates_in_the_file(scene: Scene, tmp_path: Path) -> None:
+    """Somebody writes a certificate of his own authority, a revoked one, and nonsense into the file of known ones."""
+    foreign = load_signer(Authority(tmp_path, scene.authority.name).part("tiles", "t1"))
+    revoked = load_signer(revoked_folder := scene.authority.part("tiles", "listed"))
+    folder = scene.authority.part("vehicle", "reads-file")
+    scene.authority.revoke(revoked_folder, folder)
+    entries = b"".join(len(one).to_bytes(2, "little") + one for one in (foreign.chain, revoked.chain))
+    (folder / FILE).write_bytes(entries + b"\xff\xffnonsense")
+    with scene.join(folder) as bus:
+        sealing = bus.connection.sealing
+        assert sealing is not None
+        assert sealing._certificates.holder(foreign.certificate_id) is None
+        assert sealing._certificates.holder(revoked.certificate_id) is None
+        assert bus.request(TILES, b"which", kind="tile", retry=SOON) == b"true"

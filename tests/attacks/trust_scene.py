@@ -2,10 +2,11 @@
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
@@ -19,7 +20,7 @@ from merger_world import BALL, GROUND, WALL, State, change_of, gaussians_of, rep
 
 SHARD = "guarded"
 FIRST = 497353963152
-STREETS = 15
+STREETS = 24
 NS = 1_700_000_000_000_000_000
 WIDE = 24
 Changes = Mapping[TileId, Mapping[int, State | None]]
@@ -41,6 +42,19 @@ def free(tile: TileId) -> list[int]:
     return _voxels(tile, 13, (40, 41))
 
 
+def block(tile: TileId) -> Gaussians:
+    """A tile that is full of masonry: of so much one vehicle is believed 2 %."""
+    grid = VoxelGrid.of(tile)
+    ids = [int(grid.voxel_id(x, y, z)) for x in range(2, 27) for y in range(2, 27) for z in range(39, 63)]
+    return gaussians_of(dict.fromkeys(ids, WALL))
+
+
+def corner(tile: TileId) -> list[int]:
+    """Voxels of the block on its top, in one piece: nearly 2 % of it."""
+    grid = VoxelGrid.of(tile)
+    return sorted(int(grid.voxel_id(x, y, 62)) for x in range(2, 27) for y in range(2, 14))
+
+
 def base(tile: TileId) -> Gaussians:
     """The tile as the map has it."""
     ground = [voxel for row in (7, 8, 9, 10) for voxel in _voxels(tile, row, (39,))]
@@ -57,6 +71,7 @@ class Street:
     sent: int = 0
 
     def __post_init__(self) -> None:
+        assert self.number < STREETS, "the map holds no such street"
         self.tiles = [TileId(FIRST + 4 * self.number + k) for k in range(4)]
 
     @property
@@ -79,21 +94,36 @@ class Street:
         """Vehicles of one street are not those of another."""
         return f"{vehicle}-{self.number}"
 
-    def report(self, vehicle: str, changes: Changes, at_s: int | None = None) -> ChangeReport:
-        """What a vehicle says of all tiles; all else is as in the map. Vehicles drive a minute after each other."""
+    def report(
+        self,
+        vehicle: str,
+        changes: Changes,
+        at_s: int | None = None,
+        *,
+        tiles: Sequence[TileId] = (),
+        unsure: Changes = NOTHING,
+        cells: int = 0,
+    ) -> ChangeReport:
+        """What a vehicle says of all tiles, or of some; all else is as in the map, but for what it is unsure of, with
+        so many cells. Vehicles drive a minute after each other.
+        """
         self.sent += 1
         at_ns = NS + (60 * self.sent if at_s is None else at_s) * 10**9
-        tiles = [
-            change_of(base(tile), sorted([*base(tile).voxel_id, *free(tile)]), changes.get(tile, {}), tile=tile)
-            for tile in self.tiles
-        ]
-        made = report_of(1000 * self.number + self.sent, *tiles, vehicle=self.name(vehicle))
+        told = []
+        for tile in tiles or self.tiles:
+            met = gaussians_of(unsure.get(tile, {}), cells, cells)
+            seen = sorted({*base(tile).voxel_id.tolist(), *free(tile)} - {*met.voxel_id.tolist()})
+            said = change_of(base(tile), seen, changes.get(tile, {}), tile=tile)
+            told.append(replace(said, unsure=met))
+        made = report_of(1000 * self.number + self.sent, *told, vehicle=self.name(vehicle))
         return replace(made, first_ns=at_ns - 20 * 10**9, last_ns=at_ns)
 
-    def say(self, vehicle: str, changes: Changes, at_s: int | None = None) -> None:
+    def say(self, vehicle: str, changes: Changes, at_s: int | None = None, **said: Any) -> ChangeReport:
         """Send it over the bus; it is acknowledged."""
-        ack = self.cloud.send(self.report(vehicle, changes, at_s))
+        report = self.report(vehicle, changes, at_s, **said)
+        ack = self.cloud.send(report)
         assert ack.status in ("stored", "duplicate"), ack
+        return report
 
     def settle(self) -> None:
         """Until all is merged and announced."""

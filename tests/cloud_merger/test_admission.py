@@ -4,7 +4,14 @@ import pytest
 
 from gnd.cloud_merger import admission
 from gnd.cloud_merger.admission import Admission, TokenBucket
-from gnd.cloud_merger.served import ServedCpu
+from gnd.cloud_merger.metrics import ShardMetrics
+from gnd.cloud_merger.served import (
+    CPU_S_A_MINUTE,
+    CPU_S_AT_ONCE,
+    NEW_CPU_S_A_MINUTE,
+    NEW_CPU_S_AT_ONCE,
+    ServedCpu,
+)
 from gnd.fleet_bus.errors import Busy
 from gnd.schemas.upload_head import UploadHead
 from gnd.tile_store.uploads import FirstHalf
@@ -144,7 +151,7 @@ def test_who_has_had_least_comes_first_and_invented_names_do_not(clock):
     served.spent("little", 0.1)
     served.spent("much", 5.0)
     for n in range(100):
-        served.spent(f"invented-{n}", 1.0)
+        served.spent(f"invented-{n}", 0.01)
     assert served.in_turn(["much", "new", "little"]) == ["little", "much", "new"]
     clock.now_s += 3600.0
     served.spent("little", 1.0)
@@ -160,3 +167,68 @@ def test_of_names_that_are_new_one_comes_after_three_that_are_known(clock):
     turns = served.in_turn([*(f"new-{n}" for n in range(50)), *known])
     assert [name.startswith("new") for name in turns[:9]] == [False, False, False, True] * 2 + [True]
     assert sorted(turns) == sorted([*(f"new-{n}" for n in range(50)), *known])
+
+
+def known_ones(served, clock, *names) -> None:
+    served.in_turn(names)
+    clock.now_s += 31.0
+    served.in_turn(names)
+
+
+def test_who_used_more_cpu_than_a_vehicle_may_waits_until_its_bucket_has_filled(clock):
+    served = ServedCpu(clock)
+    known_ones(served, clock, "dear", "cheap")
+    for _ in range(round(2 * CPU_S_AT_ONCE)):
+        served.spent("dear", 1.0)
+    assert served.in_turn(["dear", "cheap"]) == ["cheap"]
+    assert served.held_back == 1
+    clock.now_s += 60.0 * (CPU_S_AT_ONCE / CPU_S_A_MINUTE) - 2.0
+    assert served.in_turn(["dear", "cheap"]) == ["cheap"]
+    clock.now_s += 4.0
+    assert set(served.in_turn(["dear", "cheap"])) == {"dear", "cheap"}
+    assert served.held_back == 0
+
+
+def test_what_invented_names_cost_a_minute_is_bounded_while_known_vehicles_come(clock):
+    served = ServedCpu(clock)
+    known_ones(served, clock, "known")
+    spent_s, cost_s = 0.0, 0.05
+    for n in range(60_000):  # ten minutes, ten looks a second
+        turns = served.in_turn(["known", f"invented-{n}"])
+        assert "known" in turns
+        if len(turns) == 2:
+            served.spent(turns[1], cost_s)
+            spent_s += cost_s
+        clock.now_s += 0.01
+    assert spent_s <= 10 * NEW_CPU_S_A_MINUTE + NEW_CPU_S_AT_ONCE + cost_s
+    assert spent_s >= 10 * NEW_CPU_S_A_MINUTE
+
+
+def test_where_all_are_new_nobody_waits_for_the_share_of_newcomers(clock):
+    served = ServedCpu(clock)
+    for n in range(100):
+        served.spent(f"new-{n}", 1.0)
+    assert len(served.in_turn([f"new-{n}" for n in range(100)])) == 100
+
+
+def test_newcomers_are_patient_while_known_vehicles_come(desk, clock):
+    assert desk.admit("key", head("car"), 100) == 0.0, "all are new"
+    clock.now_s += 31.0
+    assert desk.admit("key", head("car"), 100) == 0.0
+    assert desk.admit("key", head("new"), 100) == admission.PATIENT_S
+    clock.now_s += 11.0
+    assert desk.admit("key", head("newer"), 100) == 0.0, "nobody else sends"
+
+
+def test_metrics_show_what_was_spent_and_who_waits(clock):
+    served, metrics = ServedCpu(clock), ShardMetrics()
+    metrics.show_served(served)
+    known_ones(served, clock, "dear")
+    for _ in range(100):
+        served.spent("dear", 1.0)
+    served.spent("new", 2.0)
+    served.in_turn(["dear", "new"])
+    shown = {(one.name, one.labels.get("whose")): one.value for m in metrics.registry.collect() for one in m.samples}
+    assert shown["gnd_vehicles_held_back", None] == 1
+    assert shown["gnd_upload_cpu_seconds", "known"] == 100.0
+    assert shown["gnd_upload_cpu_seconds", "new"] == 2.0

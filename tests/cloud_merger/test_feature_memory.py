@@ -198,7 +198,7 @@ def test_two_signs_that_a_report_has_told_apart_stay_two_in_later_windows(cloud)
 
 def test_a_place_becomes_as_sure_over_windows_as_in_one(tmp_path, monkeypatch):
     """The same measurements: in one window, and in as many as there are; of 40 vehicles, each twice."""
-    monkeypatch.setattr("gnd.tile_store.sqlite_journal.WINDOW_VEHICLES", 999)
+    monkeypatch.setattr("gnd.tile_store.sql_journal.WINDOW_VEHICLES", 999)
     rng = np.random.default_rng(7)
     at = rng.normal([1.0, 1.0], 0.3, (80, 2))
     got = []

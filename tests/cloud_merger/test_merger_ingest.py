@@ -7,7 +7,7 @@ import pytest
 from merger_world import GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
 from upload_desk import NOW, Desk
 
-from gnd.cloud_merger import expander
+from gnd.cloud_merger import expander, served
 from gnd.cloud_merger.checking import IngestLimits
 from gnd.cloud_merger.errors import MergerError
 from gnd.gnd_map.gaussian import Gaussians
@@ -248,3 +248,24 @@ def test_many_threads_may_report_and_look_at_once(store, desk):
 def test_absurd_limits_are_refused():
     with pytest.raises(MergerError, match="reach_tiles"):
         IngestLimits(reach_tiles=-1)
+
+
+def test_who_used_too_much_cpu_waits_in_the_store_while_others_are_looked_at(store, monkeypatch):
+    """What was acknowledged is kept, and looked at when the share of its vehicle has filled again."""
+    monkeypatch.setattr(served, "CPU_S_AT_ONCE", 1e-6)
+    now_s = [1000.0]
+    desk = Desk(store)
+    desk.expander.served = served.ServedCpu(lambda: now_s[0])
+    dear = [dataclasses.replace(good(number), vehicle="dear") for number in range(20)]
+    for report in dear:
+        assert desk.ack(KEY, report.encode()).status == "stored"
+    desk.work()
+    waiting = store.uploads_waiting("dear", 100)
+    assert waiting >= 12, "no more than was claimed at once"
+    assert desk.expander.served.held_back == 1
+    assert desk.send(KEY, dataclasses.replace(good(99), vehicle="cheap").encode()).status == "released"
+    assert store.uploads_waiting("dear", 100) == waiting
+    while store.uploads_waiting("dear", 100):
+        now_s[0] += 60.0
+        desk.work()
+    assert {desk.state("dear", report.report_id).status for report in dear} == {"released"}

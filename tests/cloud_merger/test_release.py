@@ -32,7 +32,7 @@ from gnd.schemas.errors import BadValue, SchemaError
 from gnd.schemas.health import HealthReport, TileHealth
 from gnd.schemas.keys import health_key
 from gnd.tile_store import releasing
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.released import released
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoreConfig

@@ -12,7 +12,7 @@ from release_scene import BASE, SHARDS, ReleaseCloud, wait_for
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.ownership import owner_of
 from gnd.cloud_merger.verify import Verifier
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 
 BADLY, WELL = [400 + k for k in range(8)], [785 + k for k in range(9)]
 

@@ -1,5 +1,7 @@
 """Packing and expanding undo each other, whatever is flagged against whatever base."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -40,7 +42,14 @@ def change(rng, tile):
     there = kind != ChangeClass.DELETED
     changed = concat([gaussians(rng, chosen[there], REPORT), Gaussians.nothing_at(chosen[~there])])
     said = change_of(base if len(base) else None, sorted({*chosen.tolist(), 5}), changed, tile=tile)
-    return base, type(said)(**{name: getattr(said, name) for name in said.__slots__} | {"change_class": kind})
+    return base, replace(said, change_class=kind, unsure=met(rng, np.setdiff1d(VOXELS, [*held, *chosen])))
+
+
+def met(rng, free):
+    """What any vehicle may be unsure of, in voxels in which the map holds nothing; often nothing."""
+    ids = np.sort(rng.choice(free, rng.choice([0, 1, 30]), replace=False))
+    some, cells = gaussians(rng, ids, REPORT), rng.integers(1, 20, len(ids)).astype(np.int32)
+    return snap(Gaussians(some.voxel_id, cells, cells.copy(), some.mean_m, some.cov_m2), REPORT)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -58,6 +67,8 @@ def test_what_is_packed_comes_out_again_and_only_what_was_wanted(seed):
     assert [c.changed.voxel_id.tolist() for c in expanded.tiles] == [c.changed.voxel_id.tolist() for c in changes]
     assert [c.change_class.tolist() for c in expanded.tiles] == [c.change_class.tolist() for c in changes]
     assert not any(c.changed.exists.any() for c in expanded.tiles)
+    assert [c.unsure for c in expanded.tiles] == [c.unsure for c in changes]
+    assert not any(np.isin(c.observed, c.unsure.voxel_id).any() for c in expanded.tiles)
 
     mask = rng.random(askable(report)) < rng.random()
     wanted = encode_mask(mask)

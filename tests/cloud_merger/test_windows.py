@@ -22,6 +22,7 @@ from merger_world import (
 )
 
 from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.expander import rows_of
 from gnd.cloud_merger.memory import CLAIMS_OF_VEHICLE, CLAIMS_OF_VOXEL, TileMemory
 from gnd.cloud_merger.stored import decode_state
 from gnd.cloud_merger.verify import Verifier
@@ -29,7 +30,7 @@ from gnd.cloud_merger.work import Worker
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.changes import split
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.values import ReportRow, StoreConfig
+from gnd.tile_store.values import StoreConfig
 
 BASE = {0: GROUND, 1: WALL, 2: POLE}
 EVERYTHING = [0, 1, 2, 3, 4, 5]
@@ -53,17 +54,19 @@ class Cloud:
     def ids(self):
         return self.head().voxel_id.tolist()
 
-    def hears(self, vehicle, changed=None, observed=EVERYTHING, base=None, later_s=60.0, withheld=()):
-        """One report: these voxels changed against the version, the others are as in it."""
+    def hears(self, vehicle, changed=None, observed=EVERYTHING, base=None, later_s=60.0, withheld=(), unsure=None):
+        """One report: these voxels changed against the version, it is unsure of some, the others are as in it."""
         self.now_ns += round(later_s * 1e9)
         self.number += 1
         base = self.head() if base is None else base
         change = change_of(base, sorted({*observed, *(changed or {})}), changed or {}, withheld=withheld)
+        change = replace(change, unsure=gaussians_of(unsure or {}, 10, 10))
         times = {"first_ns": self.now_ns - 10**9, "last_ns": self.now_ns}
         report = replace(report_of(self.number, change, vehicle=vehicle), **times)
         ((tile, body),) = split(report)
-        row = ReportRow(report.report_id, "ndt", tile, vehicle, self.now_ns, body, change.base_sha)
-        self.store.put_reports([replace(row, is_quiet=not changed)])
+        (row,) = rows_of(report, self.now_ns)
+        assert (row.tile, row.body) == (tile, body)
+        self.store.put_reports([row])
         return report
 
     def merges(self):
@@ -125,7 +128,7 @@ def test_a_settled_voxel_does_not_change_on_one_vehicles_word_nor_on_its_repetit
 
 
 def test_a_vehicle_that_talks_closes_no_window(tmp_path, monkeypatch):
-    monkeypatch.setattr("gnd.tile_store.sqlite_journal.WINDOW_VEHICLES", 3)
+    monkeypatch.setattr("gnd.tile_store.sql_journal.WINDOW_VEHICLES", 3)
     cloud = Cloud(tmp_path / "map.sqlite")
     cloud.sees(["a", "b", "c"], later_s=1)
     cloud.sees(["a"] * 20, later_s=1)
@@ -153,6 +156,35 @@ def test_vehicles_that_each_saw_too_little_decide_together_over_many_windows(clo
         if k < 2:
             assert cloud.ids() == [0, 1, 2]
     assert cloud.ids() == [0, 1, 2, 3]
+
+
+def test_what_several_met_is_published_remembered_and_computed_anew(cloud):
+    """The voxel of which each is unsure is new for all of them; later windows confirm it, and every version is what the
+    journal gives.
+    """
+    cloud.sees(["one"], observed=[0, 1, 2], unsure={3: WALL})
+    assert cloud.ids() == [0, 1, 2]
+    cloud.sees(["two"], observed=[0, 1, 2], unsure={3: WALL}, base=gaussians_of(BASE))
+    assert cloud.ids() == [0, 1, 2, 3]
+    for k in range(40):
+        cloud.sees([f"later-{k}"], observed=[0, 1, 2, 3], later_s=400)
+    assert cloud.ids() == [0, 1, 2, 3]
+    known = cloud.state().memory.voxels
+    assert known["observers"][known["voxel_id"] == 3] > 2
+    assert set(cloud.verified()) == {"given", "same"}
+
+
+def test_what_two_met_against_a_settled_voxel_is_remembered_until_enough_have_met_it(cloud):
+    """Many found nothing there, window for window; then a thing comes that each vehicle meets too seldom."""
+    cloud.sees(crowd(12), observed=EVERYTHING, later_s=400)
+    assert cloud.ids() == [0, 1, 2]
+    needed = 0
+    while cloud.ids() == [0, 1, 2] and needed < 40:
+        needed += 2
+        cloud.sees([f"a-{needed}", f"b-{needed}"], observed=[0, 1, 2], unsure={3: WALL}, later_s=60)
+        cloud.now_ns += HOUR_NS
+    assert 4 <= needed <= 12
+    assert set(cloud.verified()) == {"given", "same"}
 
 
 def test_each_confirmation_takes_a_claim_away(cloud):

@@ -100,6 +100,8 @@ def test_the_commands_after_a_run_are_named(tmp_path: Path) -> None:
 
 
 def test_made_up_boxes_are_for_recordings() -> None:
+    with pytest.raises(DeployError, match="--map takes a file"):
+        Source((Path("a.mcap"),), Path("postgresql://gnd@db/gnd"))
     with pytest.raises(DeployError, match="--made-up goes with --drives"):
         Source(made_up=3)
 

@@ -20,7 +20,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.tile_store import releasing
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.build import build_map
 from gnd.tile_store.trials import TrialTerms, VersionTrial
 from gnd.tile_store.values import Publication, ReportRow

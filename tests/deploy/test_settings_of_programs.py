@@ -25,12 +25,14 @@ BARE: dict[str, Any] = {
     "agent": AgentConfig("v", Path("drive.mcap"), Path("work")),
     "fleet": FleetConfig(),
     "merger": ShardConfig(),
-    "store": TileServerConfig(Path("map.sqlite")),
+    "store": TileServerConfig("map.sqlite"),
 }
 WORDS = {
+    "store_path": "other.sqlite", "path": "other.sqlite",
     "shard_id": "merger-7", "codec": "float", "link": "3g", "layer": "ndt2", "vehicle": "w", "localise_by": "lidar",
     "wrong_mounts": ("3:0.5",), "connect": ("tcp/10.0.0.1:7448",),
     "layers": ("ndt", "signs"), "passing_rule": "ahead", "protocol": "full", "mode": "paper",
+    "tiles_from": "https://tiles.example.org/map",
     "source": "",  # another needs that there is no recording
     "points": "/a/points", "gnss": "/a/fix", "speed": "/a/odometry", "imu": "/a/imu", "vehicle_frame": "base",
     "mount": (0.5, 0.0, 1.5, 0.0, 0.0, 90.0), "family": "suburb",

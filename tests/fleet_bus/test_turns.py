@@ -156,3 +156,72 @@ def test_addresses_are_compared_in_one_form():
 def test_limits_that_close_everything_are_refused():
     with pytest.raises(BusConfigError):
         GuardLimits(handshake_s=0.0, handshakes=1, of_address=1)
+
+
+def test_newcomers_leave_threads_to_the_known_while_those_come(clock):
+    held, began, count = threading.Event(), [], 8
+
+    def handle(item):
+        began.append(item)
+        assert held.wait(20)
+
+    workers = InTurn("test", handle, count, 1000, clock)
+    try:
+        workers.offer("known", 0, "known")
+        clock.now_s += turns.KNOWN_AFTER_S + 1.0
+        workers.offer("known", 0, "known again")
+        until(lambda: len(began) == 2)
+        for n in range(100):
+            workers.offer(f"new-{n}", 0, "new")
+        share = count // turns.NEWCOMERS_THREADS - 1  # one has what came before it was known
+        until(lambda: began.count("new") == share)
+        workers.offer("known", 0, "known at last")
+        until(lambda: "known at last" in began)
+        assert began.count("new") == share
+    finally:
+        held.set()
+        workers.close()
+
+
+def test_newcomers_have_all_threads_where_nobody_is_known(clock):
+    held, began = threading.Event(), []
+
+    def handle(item):
+        began.append(item)
+        assert held.wait(20)
+
+    workers = InTurn("test", handle, 8, 1000, clock)
+    try:
+        for n in range(20):
+            workers.offer(f"new-{n}", 0, "new")
+        until(lambda: len(began) == 8)
+    finally:
+        held.set()
+        workers.close()
+
+
+def until(condition) -> None:
+    for _ in range(4000):
+        if condition():
+            return
+        threading.Event().wait(0.005)
+    raise AssertionError(condition)
+
+
+def test_long_keys_are_not_kept(clock):
+    """A key may have 65,535 characters, and 65,536 turns are remembered."""
+    known = turns.KnownTurns(clock)
+    workers = InTurn("test", lambda _item: None, 1, 10, clock)
+    workers._turns = known
+    for n in range(10):
+        workers.offer(f"{n}" + 60_000 * "x", 0, "item")
+    workers.close()
+    assert sum(map(len, known._new)) <= 10 * turns.LONGEST_TURN
+
+
+def test_a_session_that_is_not_named_for_a_moment_keeps_its_connection():
+    """zenoh may not name it while it is given up or renewed: it has the time of a handshake again."""
+    limits = GuardLimits(handshake_s=5.0, handshakes=10, of_address=10)
+    one = SeenConnection(3, 33, ("10.0.0.1", 5), since_s=0.0, session_s=100.0)
+    assert to_close([one], [], limits, 104.0) == []
+    assert to_close([one], [], limits, 106.0) == [(one, "handshake")]

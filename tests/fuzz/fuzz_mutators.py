@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from itertools import islice
 from random import Random
 from typing import Any, Final
 
@@ -18,6 +19,7 @@ _WORDS: Final = (
     "9223372036854775808", "4294967295", "1e999", "true", "false", "null", "''", '""', "[]", "{}", "\u0661", "\x00",
     "x" * 300, "../..", "0x10", "1_000", "1.5", "[" * 3000, "{\"a\":" * 3000, "é", "\ud7ff", "1 2",
 )  # fmt: skip
+_MOST_MATCHES: Final = 1000
 _NUMBER: Final = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _TOKEN: Final = re.compile(rb"[A-Za-z_][A-Za-z0-9_.:-]*|-?\d+(?:\.\d+)?|[^\sA-Za-z0-9]")
 
@@ -85,7 +87,7 @@ def text_mutated(data: bytes, rng: Random) -> bytes:
 def _replaced(data: bytes, pattern: re.Pattern[bytes], rng: Random) -> bytes:
     """One to three matches become an extreme word, or another match."""
     for _ in range(rng.randint(1, 3)):
-        found = list(pattern.finditer(data))
+        found = list(islice(pattern.finditer(data), _MOST_MATCHES))
         if not found:
             return bytes_mutated(data, rng)
         at = rng.choice(found)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from random import Random
-from traceback import extract_tb
+from traceback import walk_tb
 from typing import Final
 
 from gnd.gnd_map.errors import GndError
@@ -95,11 +95,11 @@ def peak_rss_bytes() -> int:
 
 def place_of(error: BaseException) -> str:
     """Class, file and line where an error was raised, innermost of our own files, then innermost of all."""
-    frames = extract_tb(error.__traceback__)
+    frames = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]  # reads no source
     if not frames:
         return type(error).__name__
-    ours = [one for one in frames if "/gnd/" in one.filename or "/studies/" in one.filename]
+    ours = [one for one in frames if "/gnd/" in one[0] or "/studies/" in one[0]]
     named = [(ours or frames)[-1], frames[-1]]
     return f"{type(error).__name__} " + " < ".join(
-        dict.fromkeys(f"{'/'.join(one.filename.split('/')[-2:])}:{one.lineno}" for one in named)
+        dict.fromkeys(f"{'/'.join(name.split('/')[-2:])}:{line}" for name, line in named)
     )

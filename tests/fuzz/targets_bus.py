@@ -11,7 +11,7 @@ import numpy as np
 from feature_values import FEATURE_GOLDEN
 from fuzz_mutators import Mutate, bytes_mutated, message_mutated, text_mutated
 from fuzz_target import FuzzTarget
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 from schema_values import GOLDEN, HELD, REPORT_ID, TILE, gaussians, kind_of
 from survey_street import Driven, survey_of_drive
 
@@ -37,7 +37,10 @@ from gnd.schemas.drive import (
 )
 from gnd.schemas.drive_mcap import _MESSAGES as ITEM_MESSAGES
 from gnd.schemas.drive_mcap import ITEM_TOPICS, item_of, message_of
+from gnd.schemas.errors import Malformed
 from gnd.schemas.generated import (
+    archive_index_pb2,
+    archive_root_pb2,
     catalog_pb2,
     change_ack_pb2,
     change_report_pb2,
@@ -50,6 +53,7 @@ from gnd.schemas.generated import (
     tiles_reply_pb2,
     tiles_request_pb2,
     traffic_sample_pb2,
+    version_signatures_pb2,
 )
 from gnd.schemas.packed import decode_upload
 from gnd.schemas.report_id import check_report_id, report_id_of_bytes
@@ -60,6 +64,7 @@ from gnd.schemas.tiles import TileReply, blob_of, content_of, tile_after
 from gnd.schemas.tiles_batch import TilesReply
 from gnd.schemas.updates import TileUpdate, updated
 from gnd.schemas.upload_head import head_of_upload
+from gnd.schemas.version_signature import VersionSignature, decode_signatures, signatures_message
 from gnd.tile_store.arguments import parse_place, parse_tile, parse_time_ns, parse_versions
 from gnd.vehicle_agent.sources import ros2_messages
 from gnd.vehicle_agent.sources.plain_keys import header_message, read_header_message
@@ -71,6 +76,8 @@ _MESSAGES: dict[str, type[Message]] = {
     "TilesRequest": tiles_request_pb2.TilesRequest,
     "TilesReply": tiles_reply_pb2.TilesReply,
     "Catalog": catalog_pb2.Catalog,
+    "ArchiveIndex": archive_index_pb2.ArchiveIndex,
+    "ArchiveRoot": archive_root_pb2.ArchiveRoot,
     "ChangeAck": change_ack_pb2.ChangeAck,
     "TileUpdate": tile_update_pb2.TileUpdate,
     "TrafficSample": traffic_sample_pb2.TrafficSample,
@@ -78,7 +85,7 @@ _MESSAGES: dict[str, type[Message]] = {
 _FILES = {
     "TileRequest": "tiles", "TileBlob": "tiles", "TileReply": "tiles", "Catalog": "tiles",
     "TilesRequest": "tiles_batch", "TilesReply": "tiles_batch", "ChangeAck": "changes", "TileUpdate": "updates",
-    "TrafficSample": "traffic",
+    "TrafficSample": "traffic", "ArchiveIndex": "archive", "ArchiveRoot": "archive",
 }  # fmt: skip
 
 
@@ -339,7 +346,42 @@ def _request_seeds() -> list[bytes]:
     return [ros2_messages.encode(differential_service().request, {"area": area, "cached_ids": ["a", "b"]})]
 
 
+def _signed_versions(data: bytes) -> object:
+    """The first byte says how many versions there are."""
+    message = version_signatures_pb2.VersionSignatures()
+    try:
+        message.ParseFromString(data[1:])
+    except DecodeError as error:
+        raise Malformed("no signatures") from error  # in a reply that is one
+    found = decode_signatures(message, data[0] if data else 0)
+    if (again := signatures_message(found)) is not None:
+        assert decode_signatures(again, len(found)) == found
+    for one in found:
+        if one is not None:
+            one.statement("ndt", TILE, 3, HELD.sha, 9750).text(one.signer, one.signed_s)
+    return found
+
+
+def _signature_lists() -> list[bytes]:
+    signed = [
+        VersionSignature(bytes(7) + bytes([k]), "merged", 1_700_000_000 + k, 1_700_000_003, bytes(64))
+        for k in (1, 2, 3)
+    ]
+    lists = [signed, signed[:1], [signed[0], None, signed[2]], signed[:1] * 3]
+    return [bytes([len(one)]) + _signatures(one) for one in lists]
+
+
+def _signatures(some: list[VersionSignature | None] | list[VersionSignature]) -> bytes:
+    message = signatures_message(some)
+    assert message is not None
+    return message.SerializeToString()
+
+
 TARGETS = (
+    FuzzTarget(
+        "VersionSignatures", ("schemas/version_signature.py:decode_signatures",),
+        "gnd.v1.VersionSignatures (protobuf, in replies)", _signed_versions, _signature_lists, bytes_mutated,
+    ),
     *(_message_target(name) for name in _MESSAGES),
     *_UPLOADS,
     FuzzTarget(

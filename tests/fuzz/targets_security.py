@@ -1,20 +1,29 @@
 """Targets: seals, certificates, lists of an authority, and what vehicles tell of versions on trial."""
 
 import datetime as dt
+import warnings
+from contextlib import suppress
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.utils import CryptographyDeprecationWarning
 from cryptography.x509.oid import NameOID
 from fuzz_mutators import bytes_mutated, message_mutated, text_mutated
 from fuzz_target import FuzzTarget
 
+from gnd.fleet_bus.errors import NotAnsweredFor, SealError
 from gnd.fleet_bus.identity.lists import MemberList, load_revoked
 from gnd.fleet_bus.identity.names import MemberName
-from gnd.fleet_bus.seal_keys import certificates_of, holder_of, read_revoked
+from gnd.fleet_bus.publishers import Publishers
+from gnd.fleet_bus.remembered import read_chains
+from gnd.fleet_bus.seal_keys import certificates_of, holder_of, holder_of_chain, read_revoked
 from gnd.fleet_bus.seals import Seal
+from gnd.fleet_bus.short_seals import ShortSeal
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.generated import health_report_pb2
 from gnd.schemas.health import HealthReport, TileHealth
@@ -42,7 +51,25 @@ def _chain() -> bytes:
 
 
 def _holders(data: bytes) -> object:
-    return [holder_of(one) for one in certificates_of(data)]
+    with warnings.catch_warnings():  # about serial numbers that later releases of the library refuse
+        warnings.simplefilter("ignore", CryptographyDeprecationWarning)
+        certificates = certificates_of(data)
+        with suppress(SealError):  # most are not signed; what they say is read all the same
+            holder_of_chain(data, [_authority()[0]])
+    return [holder_of(one) for one in certificates]
+
+
+@cache
+def _publishers() -> Publishers:
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "authority.pem").write_bytes(_authority()[0].public_bytes(Encoding.PEM))
+        return Publishers(Path(folder))
+
+
+def _publisher(data: bytes) -> object:
+    with suppress(NotAnsweredFor):  # read, and of a vehicle
+        return _publishers().learn(data)
+    return None
 
 
 def _lists(data: bytes) -> object:
@@ -55,8 +82,26 @@ def _seals() -> list[bytes]:
         Seal("question", bytes(8), 1, bytes(64), bytes(8), chain=b"\x01\x00x"),
         Seal("answer", bytes(8), 0, bytes(64)),
         Seal("number", b"", 0, b"", bytes(8), count_wanted=True),
+        Seal("question", bytes(8), 1, bytes(64), bytes(8), chain=b"\x01\x00x", share=bytes(32)),
+        Seal("answer", bytes(8), 0, bytes(64), share=bytes(32)),
     )
     return [seal.encode() for seal in seals]
+
+
+def _short_seals() -> list[bytes]:
+    seals = (
+        ShortSeal("question", bytes(4), bytes(3), 1),
+        ShortSeal("question", bytes(8), bytes(3), 1 << 27),
+        ShortSeal("answer", bytes(8)),
+        ShortSeal("refusal", bytes(8)),
+        ShortSeal("notice", bytes(8), bytes(3), 300),
+    )
+    return [seal.encode() for seal in seals]
+
+
+def _known() -> list[bytes]:
+    chain = _chain()
+    return [2 * (len(chain).to_bytes(2, "little") + chain), b""]
 
 
 TARGETS = (
@@ -64,7 +109,26 @@ TARGETS = (
         "seal", ("fleet_bus/seals.py:Seal.decode",), "seals (attachments)", Seal.decode, _seals, bytes_mutated
     ),
     FuzzTarget(
+        "short-seal",
+        ("fleet_bus/short_seals.py:ShortSeal.decode",),
+        "short seals (attachments)",
+        lambda data: ShortSeal.decode(data).encode(),
+        _short_seals,
+        bytes_mutated,
+    ),
+    FuzzTarget(
+        "known-certificates",
+        ("fleet_bus/remembered.py:read_chains",),
+        "certificates of others, kept over a start",
+        read_chains,
+        _known,
+        bytes_mutated,
+    ),
+    FuzzTarget(
         "certificate-chain", (), "certificates of a seal (DER)", _holders, lambda: [_chain()], bytes_mutated
+    ),
+    FuzzTarget(
+        "publisher-chain", (), "certificates of a publisher (DER)", _publisher, lambda: [_chain()], bytes_mutated
     ),
     FuzzTarget(
         "revoked",

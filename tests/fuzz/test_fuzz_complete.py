@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from fuzz_all import TARGETS
@@ -68,10 +69,15 @@ EXCEPTIONS = {
     "schemas/wire.py:parse": "inside of every target of a message",
     "tile_store/feature_io/stored.py:import_features": OF_TARGET,
     "tile_store/feature_io/stored.py:load_features": "a store, which has a target",
-    "tile_store/sqlite_roads.py:open_roads": OPENS,
-    "tile_store/sqlite_trials.py:open_trial": "a store, which has a target",
-    "tile_store/sqlite_trials.py:open_trials": "a store, which has a target",
-    "tile_store/sqlite_store.py:SqliteStore.load": "a store, which has a target",
+    "tile_store/location.py:open_store": OPENS,
+    "tile_store/copying/ends.py:End.reading": OPENS,
+    "tile_store/bodies.py:Bodies.read": "the codec of a stored tile, which has a target",
+    "tile_store/objects.py:open_objects": OPENS,
+    "tile_store/postgres_connection.py:DatabaseClock.read_with": OPENS,
+    "tile_store/sql_roads.py:open_roads": OPENS,
+    "tile_store/sql_trials.py:open_trial": "a store, which has a target",
+    "tile_store/sql_trials.py:open_trials": "a store, which has a target",
+    "tile_store/sqlite_store.py:SqlStore.load": "a store, which has a target",
     "tile_store/store.py:Store.load": "an interface",
     "tile_store/values.py:StoredTile.decode_features": "codec 32, which has a target",
     "vehicle_agent/importer.py:import_recording": "`open_recording`, which the targets of importers call",
@@ -103,6 +109,7 @@ def functions(body: list[ast.stmt], before: str = "") -> Iterator[tuple[str, ast
             yield before + one.name, one
 
 
+@cache
 def named_like_decoders() -> set[str]:
     """Public functions with arguments, but for properties."""
     found = set()

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from gnd.gnd_map.errors import FeatureError
 from gnd.gnd_map.features import check_simple_polyline
+from gnd.gnd_map.features.polylines import MAX_PAIRS
 
 Vertex = tuple[int, int]
 
@@ -71,3 +72,13 @@ def test_many_vertices_in_one_tile_are_compared_too() -> None:
     zigzag[-1, 1] = 5.0
     with pytest.raises(FeatureError, match="and 4094 of 4095 meet"):
         check_simple_polyline("a zigzag whose end runs back", zigzag)
+
+
+def test_strokes_that_lie_over_each_other_are_refused_before_each_pair_is_looked_at():
+    """4,096 points to and fro, slanted: nothing crosses, and every box meets every other one."""
+    k = np.arange(4096)
+    side = np.where(k % 2 == 0, 0.0, 30.0)
+    points_m = np.stack([side + 0.003 * (k // 2), side - 0.003 * (k // 2), 0.0 * k], axis=1)
+    with pytest.raises(FeatureError, match=f"more than {MAX_PAIRS} pairs"):
+        check_simple_polyline("line", points_m)
+    check_simple_polyline("line", points_m[:300])

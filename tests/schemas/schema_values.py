@@ -14,6 +14,7 @@ from gnd.gnd_map.codec import LATTICES, encode_gaussians, snap
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile, TileDelta
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.archive import UNSIGNED, ArchiveEntry, ArchiveIndex, ArchiveRoot, Pack
 from gnd.schemas.changes import ChangeAck, ChangeReport, TileChange
 from gnd.schemas.course import Course
 from gnd.schemas.doubt import Doubt, DoubtReason
@@ -23,6 +24,7 @@ from gnd.schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileR
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.traffic import TrafficLine, TrafficSample
 from gnd.schemas.updates import TileUpdate
+from gnd.schemas.version_signature import VersionSignature
 
 GOLDEN_DIR = Path(__file__).parent / "golden"
 
@@ -44,6 +46,12 @@ def gaussians(ids: Any, count: int = 40) -> Gaussians:
     mean_m = (np.arange(3 * n, dtype=np.float32).reshape(n, 3) % 7 - 3) / 8
     cov_m2 = np.tile(np.float32([0.0625, 0.015625, 0, 0.0625, 0, 0.0078125]), (n, 1))
     return Gaussians(voxel_id, np.full(n, count, np.int32), np.full(n, count // 2, np.int32), mean_m, cov_m2)
+
+
+def met(ids: Any, cells: int = 7) -> Gaussians:
+    """What a vehicle is unsure of in these voxels."""
+    some = gaussians(ids, cells)
+    return Gaussians(some.voxel_id, some.count, some.count.copy(), some.mean_m, some.cov_m2)
 
 
 def mixed(ids: Any) -> Gaussians:
@@ -139,6 +147,9 @@ def sample(**values: Any) -> TrafficSample:
 HELD = Tile(TILE, 3, snap(gaussians([-604, 0, 7, 604]), LATTICES["standard"]))
 NEXT = Tile(TILE, 4, snap(gaussians([-604, 7, 8], count=300), LATTICES["standard"]))
 
+SIGNED = VersionSignature(b"signer-1", "merged", 1_764_000_000, 1_764_000_000, bytes(range(64)))
+SIGNED_LATER = VersionSignature(b"signer-2", "base", 1_763_000_000, 1_764_000_000, bytes(range(64, 128)))
+
 GOLDEN: dict[str, Any] = {
     "TileRequest-nothing_cached": TileRequest(codecs=(0,), deltas=False),
     "TileRequest-cached-two_codecs": TileRequest(3, SHA, (1, 0), deltas=False),
@@ -167,6 +178,19 @@ GOLDEN: dict[str, Any] = {
         )
     ),
     "TilesReply-unchanged": TilesReply((TileAnswer("unchanged"),) * 100),
+    "ArchiveIndex-empty": ArchiveIndex("ndt", TILE.district),
+    "ArchiveIndex-two_packs": ArchiveIndex(
+        "ndt",
+        TILE.district,
+        (
+            ArchiveEntry(TILE, 3, SHA[:4], UNSIGNED, Pack(SHA, 4000), 0, 1200),
+            ArchiveEntry(EAST, 2**32 - 1, OTHER_SHA[:4], b"sign", Pack(OTHER_SHA, 900), 100, 800),
+        ),
+    ),
+    "ArchiveRoot-empty": ArchiveRoot(),
+    "ArchiveRoot-two_layers": ArchiveRoot(
+        {"ndt": (TileId(0).district, TILE.district), "signs": (TileId(TILE.morton + 1024).district,)}
+    ),
     "Catalog-empty": Catalog(),
     "Catalog-two_tiles": Catalog((CatalogEntry(TILE, 3, SHA), CatalogEntry(EAST, 2**32 - 1, OTHER_SHA))),
     "ChangeReport-two_tiles-with_and_without_base": report(),
@@ -174,6 +198,7 @@ GOLDEN: dict[str, Any] = {
     "ChangeReport-nothing_observed": report(tiles=(change(changed=Gaussians.empty(), observed=np.empty(0, np.int32)),)),
     "ChangeReport-doubtful": report(tiles=(change(doubt=SHIFTED, **NOTHING), change(EAST, doubt=MUCH))),
     "ChangeReport-course": report(course=Course(-910, 12)),
+    "ChangeReport-unsure": report(tiles=(change(), change(EAST, unsure=met([-690, -2, 78])))),
     "ChangeAck-stored": ChangeAck(REPORT_ID, "stored"),
     "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
@@ -192,6 +217,22 @@ GOLDEN: dict[str, Any] = {
         track=b"nor this",
         pose_sigma_tenth_mm=312,
         pose_sigma_10urad=107,
+    ),
+    "PackedReport-unsure": PackedReport(
+        report_id=REPORT_ID,
+        vehicle="car-1",
+        sensor_model="VLP-16",
+        software="gnd-fleet 0.1.0",
+        first_ns=1_700_000_000_000_000_000,
+        length_ns=1,
+        tiles=((274, 3),),
+        base_digest=SHA[:8],
+        flags=b"not looked into",
+        track=b"nor this",
+        pose_sigma_tenth_mm=812,
+        pose_sigma_10urad=87,
+        unsure=b"nor these",
+        unsure_measured=b"Gaussians",
     ),
     "PackedReport-doubtful": PackedReport(
         report_id=REPORT_ID,
@@ -239,6 +280,19 @@ GOLDEN: dict[str, Any] = {
             TileAnswer("delta", 5, SHA[:4], 0, b"not looked into"),
         )
     ),
+    "TileReply-blob-signed": TileReply(
+        "blob", blob_of(Tile(TILE, 7, gaussians([-604, 0, 604]), 9750)), signature=SIGNED
+    ),
+    "TilesReply-signed": TilesReply((TileAnswer("delta", 4, OTHER_SHA[:4], 0, b"not looked into", 9750, SIGNED),) * 2),
+    "TilesReply-some_signed": TilesReply(
+        (
+            TileAnswer("delta", 4, OTHER_SHA[:4], 0, b"not looked into", 9750, SIGNED),
+            TileAnswer("absent"),
+            TileAnswer("delta", 5, SHA[:4], 0, b"not looked into"),
+            TileAnswer("blob", 5, SHA[:4], 4, b"not looked into", 0, SIGNED_LATER),
+        )
+    ),
+    "TileUpdate-made": update(day=9750, made_s=1_764_000_000),
     "TrafficSample-two_lines": sample(),
     "TrafficSample-doubts": sample(scans_taken_back=31, tiles_held_back=2, tiles_doubtful=4, doubts=(2, 0, 1, 0, 1)),
     "TrafficSample-start": sample(
@@ -254,6 +308,8 @@ KINDS: dict[str, Any] = {
         TileBlob,
         TilesRequest,
         TilesReply,
+        ArchiveIndex,
+        ArchiveRoot,
         Catalog,
         ChangeReport,
         ChangeAck,
@@ -319,7 +375,8 @@ def any_change(draw: Any, tile: TileId) -> TileChange:
     if withholds:
         changed, seen = Gaussians.empty(), []
     observed = np.union1d(changed.voxel_id, seen).astype(np.int32)
-    n = len(changed)
+    n, free = len(changed), np.setdiff1d(np.array(draw(voxel_sets), np.int32), observed).astype(np.int32)
+    unsure = Gaussians.empty() if withholds else met(free, draw(st.integers(1, 19)))
     version, sha = draw(pairs)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     return TileChange(
@@ -333,6 +390,7 @@ def any_change(draw: Any, tile: TileId) -> TileChange:
         pose_sigma_m=draw(st.floats(0, 1000)),
         pose_sigma_rad=draw(st.floats(0, 3.15)),
         doubt=draw(any_doubt(withholds=True) if withholds else st.none() | any_doubt()),
+        unsure=unsure,
     )
 
 

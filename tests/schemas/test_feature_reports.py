@@ -183,10 +183,10 @@ def test_too_many_features_are_refused_by_their_number() -> None:
         FeatureChange(TILE, 1, SHA, 0, (one,) * 4097)
     many = tuple(Seen(number, one.existence) for number in range(1, 4097))
     tiles = tuple(type(TILE)(TILE.district.first_morton + k) for k in range(5))
-    with pytest.raises(TooLarge, match="has 20480 features, the limit is 16384"):
+    with pytest.raises(TooLarge, match="has 20480 features, the limit is 4096"):
         feature_report(tiles=tuple(FeatureChange(tile, 1, SHA, 0, many) for tile in tiles))
     lines = tuple(found(kind=f"outline{number}", points_m=np.zeros((4096, 3))) for number in range(17))
-    with pytest.raises(TooLarge, match="has 69632 points, the limit is 65536"):
+    with pytest.raises(TooLarge, match="has 69632 points, the limit is 32768"):
         feature_report(tiles=(feature_change(found=lines),))
 
 

@@ -50,6 +50,7 @@ def any_packed(draw: Any) -> PackedReport:
         pose_sigma_10urad=draw(st.integers(0, 2**32 - 1)),
         doubts=tuple((index, draw(any_doubt())) for index in doubtful),
         course=draw(st.none() | st.builds(Course, st.integers(-314_160, 314_160), st.integers(1, 314_160))),
+        **draw(st.sampled_from([{}, {"unsure": b"voxels", "unsure_measured": b"what was met"}])),
     )
 
 
@@ -115,6 +116,8 @@ def test_another_major_version_is_refused() -> None:
         ({"first_ns": 2**63 - 1, "length_ns": 1}, "last_ns"),
         ({"pose_sigma_tenth_mm": 2**32}, "pose_sigma_tenth_mm"),
         ({"pose_sigma_10urad": -1}, "pose_sigma_10urad"),
+        ({"unsure": b"some"}, "4 bytes of unsure voxels and 0 of what was met there"),
+        ({"unsure_measured": b"of none"}, "0 bytes of unsure voxels and 7 of what was met there"),
         ({"doubts": ((1, MUCH),)}, "1 doubtful tiles are not strictly ascending among its 3"),
         ({"doubts": ((17, MUCH), (0, MUCH))}, "2 doubtful tiles are not strictly ascending"),
         ({"doubts": ((17, SHIFTED),)}, "holds back 314 changes: only a whole report can"),

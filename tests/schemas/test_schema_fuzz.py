@@ -13,6 +13,8 @@ from schema_values import GOLDEN, HELD, KINDS, TILE, kind_of
 
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.generated import (
+    archive_index_pb2,
+    archive_root_pb2,
     catalog_pb2,
     change_ack_pb2,
     change_report_pb2,
@@ -32,6 +34,8 @@ MESSAGES: dict[str, type[Message]] = {
     "TileReply": tile_reply_pb2.TileReply,
     "TilesRequest": tiles_request_pb2.TilesRequest,
     "TilesReply": tiles_reply_pb2.TilesReply,
+    "ArchiveIndex": archive_index_pb2.ArchiveIndex,
+    "ArchiveRoot": archive_root_pb2.ArchiveRoot,
     "Catalog": catalog_pb2.Catalog,
     "ChangeReport": change_report_pb2.ChangeReport,
     "ChangeAck": change_ack_pb2.ChangeAck,

@@ -12,6 +12,7 @@ from schema_values import (
     GOLDEN,
     GOLDEN_DIR,
     KINDS,
+    NOTHING,
     OTHER_SHA,
     REPORT_ID,
     SHA,
@@ -22,6 +23,7 @@ from schema_values import (
     change,
     gaussians,
     kind_of,
+    met,
     pairs,
     report,
     sample,
@@ -31,12 +33,14 @@ from schema_values import (
     versions,
 )
 
+from gnd.gnd_map.codec import encode_gaussians
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile, TileDelta
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import limits
 from gnd.schemas.bitmap import decode_observed, encode_observed
 from gnd.schemas.changes import ChangeAck, ChangeReport, split
+from gnd.schemas.doubt import Doubt, DoubtReason
 from gnd.schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongHash, WrongVersion
 from gnd.schemas.generated import (
     change_report_pb2,
@@ -293,6 +297,24 @@ HOSTILE = {
         BadValue,
         r"change of tile 13033\S+: evidence of 4294967295 rays does not fit 31 bits",
     ),
+    "unsure and observed": (
+        {"unsure": encode_gaussians(met([-700, -690, 2000]))},
+        BadValue,
+        r"2 voxels are unsure and observed, first -700",
+    ),
+    "unsure of a Gaussian": (
+        {"unsure": encode_gaussians(met([-690], 20))},
+        BadValue,
+        r"unsure voxels of 20 \.\. 20 cells, not 1 \.\. 19",
+    ),
+    "unsure of nothing": ({"unsure": encode_gaussians(gaussians([-690], 0))}, BadValue, r"of 0 \.\. 0 cells"),
+    "unsure by points": (
+        {"unsure": encode_gaussians(gaussians([-690], 38))},
+        BadValue,
+        r"1 unsure voxels count points",
+    ),
+    "unsure in space": ({"unsure": encode_gaussians(met([2**30]))}, BadValue, r"lie at heights \d+ .. \d+ m"),
+    "unsure and cut off": ({"unsure": encode_gaussians(met([-690]))[:-1]}, BadValue, r"51 bytes, expected 52"),
     "NaN sigma": ({"pose_sigma_m": float("nan")}, BadValue, r"pose sigma nan m is outside"),
     "negative sigma": ({"pose_sigma_rad": -0.1}, BadValue, r"pose sigma -0\.1 rad is outside"),
     "endless sigma": ({"pose_sigma_m": float("inf")}, BadValue, r"pose sigma inf m is outside"),
@@ -324,6 +346,16 @@ def test_voxels_far_above_the_earth_are_refused() -> None:
     with pytest.raises(BadValue, match=r"heights 10001 \.\. 10001 m, the Earth's surface at -1000 \.\. 10000 m"):
         change(changed=Gaussians.empty(), observed=high)
     change(changed=Gaussians.empty(), observed=high - 1209)
+
+
+def test_unsure_voxels_of_many_tiles_are_bounded_together() -> None:
+    first, many = TILE.district.first_morton, met(np.arange(limits.MAX_UNSURE_OF_REPORT // 2))
+    tiles = tuple(change(TileId(first + k), unsure=many, **NOTHING) for k in range(3))
+    assert len(ChangeReport.decode(report(tiles=tiles[:2]).encode()).tiles[1].unsure) == len(many)
+    with pytest.raises(TooLarge, match="unsure of more than 65536 voxels in 3 tiles"):
+        report(tiles=tiles)
+    with pytest.raises(BadValue, match="5 changes are held back, and 1 voxels are named"):
+        change(unsure=met([7]), doubt=Doubt(DoubtReason.EXPLAINED_BY_SHIFT, withheld=5), **NOTHING)
 
 
 def test_many_small_bitmap_bombs_are_one_bomb() -> None:

@@ -26,6 +26,7 @@ from gnd.schemas.tiles_batch import (
     tile_of_answer,
 )
 from gnd.schemas.updates import TileUpdate, updated
+from gnd.schemas.version_signature import VersionSignature
 
 DISTRICT = TILE.district
 DELTA = encode_delta(TILE, HELD.gaussians, NEXT.gaussians)
@@ -44,13 +45,24 @@ helds = st.dictionaries(st.integers(0, 1023), held_pairs, min_size=1, max_size=3
 
 
 @st.composite
+def any_signature(draw: Any) -> VersionSignature:
+    signer = draw(st.sampled_from([b"signer-1", b"signer-2"]) | st.binary(min_size=8, max_size=8))
+    made_s, later_s = (
+        draw(st.sampled_from([0, 1_764_000_000, 2**40 - 2**33]) | st.integers(0, 2**39)),
+        draw(st.just(0) | st.integers(0, 2**32 - 1)),
+    )
+    kind = draw(st.sampled_from(["merged", "base", "rollback"]))
+    return VersionSignature(signer, kind, made_s, made_s + later_s, draw(st.binary(min_size=64, max_size=64)))
+
+
+@st.composite
 def any_answer(draw: Any) -> TileAnswer:
     status = draw(st.sampled_from(["blob", "delta", "unchanged", "absent", "later", "hash"]))
     if status not in ("blob", "delta"):
         return TileAnswer(status)
     codec = draw(st.integers(0, 2**32 - 1)) if status == "blob" else 0
     body, day = draw(st.binary(max_size=40)), draw(st.sampled_from([0, 1, 9750, 2**16 - 1]))
-    return TileAnswer(status, draw(versions), draw(shas)[:4], codec, body, day)
+    return TileAnswer(status, draw(versions), draw(shas)[:4], codec, body, day, draw(st.none() | any_signature()))
 
 
 @given(helds, st.booleans(), st.integers(1, limits.MAX_TILE_BODY_BYTES), st.none() | st.integers(0, 1023))
@@ -97,6 +109,51 @@ def test_the_day_of_a_survey_costs_four_bytes_whatever_the_number_of_tiles() -> 
     without, dated = (TilesReply((TileAnswer("delta", 4, HASH, 0, DELTA, day),) * 200).encode() for day in (0, 9750))
     assert len(dated) - len(without) == 4
     assert {answer.day for answer in TilesReply.decode(dated).answers} == {9750}
+
+
+def test_signatures_cost_64_bytes_each_and_little_more_in_all() -> None:
+    signed = VersionSignature(b"signer-1", "base", 1_764_000_000, 1_764_000_000, bytes(64))
+    for count in (1, 20, 200):
+        bare, full = (
+            TilesReply((TileAnswer("delta", 4, HASH, 0, DELTA, 9750, one),) * count).encode() for one in (None, signed)
+        )
+        assert 64 * count < len(full) - len(bare) <= 64 * count + 31
+
+
+def test_an_older_reader_passes_over_signatures() -> None:
+    """What it does not know it ignores; a reply without them is the same to the byte as before there were any."""
+    signed = VersionSignature(b"signer-1", "base", 1_764_000_000, 1_764_000_000, bytes(64))
+    bare, full = (TilesReply((TileAnswer("delta", 4, HASH, 0, DELTA, 9750, one),)).encode() for one in (None, signed))
+    message = tiles_reply_pb2.TilesReply.FromString(full)
+    message.ClearField("signatures")
+    assert message.SerializeToString(deterministic=True) == bare
+    assert TilesReply.decode(bare).answers[0].signature is None
+
+
+def test_signatures_that_are_not_one_each_are_refused() -> None:
+    signed = VersionSignature(b"signer-1", "base", 1_764_000_000, 1_764_000_000, bytes(64))
+    whole = TilesReply((TileAnswer("delta", 4, HASH, 0, DELTA, 9750, signed),) * 3).encode()
+
+    def changed(change: Any) -> bytes:
+        message = tiles_reply_pb2.TilesReply.FromString(whole)
+        change(message.signatures)
+        return message.SerializeToString()
+
+    def fewer(signatures: Any) -> None:
+        signatures.signatures = signatures.signatures[:128]
+
+    def nobody(signatures: Any) -> None:
+        signatures.signed_by[:] = [2]
+
+    def cut(signatures: Any) -> None:
+        signatures.signers = signatures.signers[:7]
+
+    def early(signatures: Any) -> None:
+        signatures.made_s[:] = [-5]
+
+    for change, why in ((fewer, "2 version signatures by 1"), (nobody, "3 version"), (cut, "7 bytes"), (early, "-5 s")):
+        with pytest.raises(BadValue, match=why):
+            TilesReply.decode(changed(change))
 
 
 def test_days_that_are_not_one_each_are_refused() -> None:

@@ -23,7 +23,7 @@ from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.se3 import transform
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.keys import update_keys
-from gnd.tile_store import sqlite_roads
+from gnd.tile_store import sql_roads
 from gnd.tile_store.build import build_map
 from gnd.tile_store.cli import map_group
 from gnd.tile_store.roads import RoadTile
@@ -108,7 +108,7 @@ def test_two_agents_survey_beyond_the_edge_and_the_map_grows(free_port: int, tmp
 
 
 def roads_of(store: SqliteStore) -> list[RoadTile]:
-    return store.look(lambda c: sqlite_roads.tiles(c, "ndt"))
+    return store.look(lambda c: sql_roads.tiles(c, "ndt"))
 
 
 def states_of(store: SqliteStore) -> set[str]:

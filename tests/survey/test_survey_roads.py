@@ -18,7 +18,7 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.survey import SurveyReport
-from gnd.tile_store import sqlite_roads
+from gnd.tile_store import sql_roads
 from gnd.tile_store.roads import RoadTile
 from gnd.tile_store.sqlite_store import SqliteStore
 
@@ -61,7 +61,7 @@ def take(store: SqliteStore, *drives: Driven) -> None:
 
 
 def roads(store: SqliteStore) -> list[RoadTile]:
-    return store.look(lambda c: sqlite_roads.tiles(c, "ndt"))
+    return store.look(lambda c: sql_roads.tiles(c, "ndt"))
 
 
 def states(store: SqliteStore) -> set[str]:
@@ -247,9 +247,9 @@ def test_only_one_shard_maps_a_layer_and_what_it_has_done_is_not_done_again(stor
     take(store, FIRST)
     later = START_NS + 60 * 10**9
     mapper = RoadMapper(store, "m1", now_ns=lambda: later)
-    assert store.transact(lambda c, _: sqlite_roads.lease(c, "ndt", "other", 60.0))
+    assert store.transact(lambda c, _: sql_roads.lease(c, "ndt", "other", 60.0))
     assert mapper.work() == 0
-    store.transact(lambda c, _: sqlite_roads.settle(c, "ndt", "other", None))
+    store.transact(lambda c, _: sql_roads.settle(c, "ndt", "other", None))
     assert mapper.work() == 1
     assert mapper.work() == 0
     assert states(store) == {"draft"}

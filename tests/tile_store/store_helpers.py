@@ -2,14 +2,19 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import apsw
 import numpy as np
+import pytest
 
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.bodies import move_out, place_of_bodies
+from gnd.tile_store.location import open_store
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import Basis, Claim, Publication, ReportRow, StoreConfig, TileWork
 
@@ -38,10 +43,66 @@ class SqliteMaker:
     """Opens the same SQLite store again and again, as several processes would."""
 
     path: Path
+    bodies: str | None = None
+    """Where bodies lie; None: in the database."""
 
-    def open(self, config: StoreConfig = EAGER, clock: Clock | None = None) -> Store:
+    @property
+    def location(self) -> Path:
+        return self.path
+
+    def open(self, config: StoreConfig = EAGER, clock: Clock | None = None, steady: Clock | None = None) -> SqlStore:
         clock = clock or Clock()
-        return SqliteStore(self.path, config, now_ns=clock, steady_ns=clock)
+        _move_bodies(self.path, self.bodies)
+        return SqliteStore(self.path, config, now_ns=clock, steady_ns=steady or clock)
+
+    def sql(self, command: str, *values: Any) -> list[Any]:
+        """What no store does."""
+        connection = apsw.Connection(str(self.path))
+        try:
+            return connection.execute(command, values).fetchall()
+        finally:
+            connection.close()
+
+
+@dataclass(frozen=True)
+class PostgresMaker:
+    """Opens the same store in a PostgreSQL database again and again, as several processes would."""
+
+    url: str
+    bodies: str | None = None
+
+    @property
+    def location(self) -> str:
+        return self.url
+
+    def open(self, config: StoreConfig = EAGER, clock: Clock | None = None, steady: Clock | None = None) -> SqlStore:
+        from gnd.tile_store.postgres_store import PostgresStore
+
+        clock = clock or Clock()
+        _move_bodies(self.url, self.bodies)
+        return PostgresStore(self.url, config, now_ns=clock, steady_ns=steady or clock)
+
+    def sql(self, command: str, *values: Any) -> list[Any]:
+        """What no store does."""
+        import psycopg
+
+        with psycopg.connect(self.url, autocommit=True) as connection:
+            done = connection.execute(command.replace("?", "%s"), values)
+            return done.fetchall() if done.description else []
+
+
+Maker = SqliteMaker | PostgresMaker
+
+
+def _move_bodies(location: Path | str, place: str | None) -> None:
+    if place is not None:
+        with open_store(location) as store:
+            if store.look(place_of_bodies) is None:
+                move_out(store, place)
+
+
+of_a_file = pytest.mark.parametrize("maker", ["sqlite"], indirect=True)
+"""A test of what only a store in a file does."""
 
 
 def tile_of_voxels(tile: TileId, *voxels: int) -> Tile:

@@ -6,7 +6,7 @@ Each says on its standard output what was confirmed to it, one line a fact, at o
 import random
 import sys
 import time
-from pathlib import Path
+from contextlib import suppress
 
 import numpy as np
 from store_helpers import TILE, report
@@ -14,7 +14,9 @@ from store_helpers import TILE, report
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.location import open_store
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import Basis, Publication, ReportRow, StoreConfig, TileWork
 
@@ -41,7 +43,12 @@ def run_reporter(store: Store, name: str, number: int) -> None:
     """Sends the reports of this vehicle from `number` on; the same number is the same report after a kill."""
     while True:
         rows = [report(number + i, TILES[(number + i) % 4], name) for i in range(3)]
-        for row, status in zip(rows, store.put_reports(rows), strict=True):
+        try:
+            told = store.put_reports(rows)
+        except StoreError:  # the server has gone: nothing is acknowledged, and what was sent is sent again
+            time.sleep(0.05)
+            continue
+        for row, status in zip(rows, told, strict=True):
             print(status, row.tile.morton, row.report_id, flush=True)
         number += 3
         time.sleep(0.002)
@@ -52,16 +59,26 @@ def run_merger(store: Store, name: str, _first: int) -> None:
     generator = random.Random()
     store.release(name)
     while True:
-        for claim in store.claim(name, 2, lease_s=0.05):
-            work = store.load(claim)
-            time.sleep(generator.uniform(0.0, 0.08))
-            (result,) = store.publish([publication_of(work)])
-            print(result.status, claim.tile.morton, result.version, flush=True)
+        with suppress(StoreError):
+            for claim in store.claim(name, 2, lease_s=0.05):
+                work = store.load(claim)
+                time.sleep(generator.uniform(0.0, 0.08))
+                (result,) = store.publish([publication_of(work)])
+                print(result.status, claim.tile.morton, result.version, flush=True)
         time.sleep(0.005)
+
+
+def opened_at_last(path: str) -> SqlStore:
+    """The store, once its server is there."""
+    while True:
+        try:
+            return open_store(path, HURRY)
+        except StoreError:
+            time.sleep(0.05)
 
 
 if __name__ == "__main__":
     role, path, name, first = sys.argv[1:]
-    with SqliteStore(Path(path), HURRY) as opened:
+    with opened_at_last(path) as opened:
         print("ready", flush=True)
         {"reporter": run_reporter, "merger": run_merger}[role](opened, name, int(first))

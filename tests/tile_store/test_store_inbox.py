@@ -4,7 +4,7 @@ import threading
 from dataclasses import replace
 
 import pytest
-from store_helpers import EAST, FAR, TILE, Clock, SqliteMaker, merge_once, report, report_id
+from store_helpers import EAST, FAR, TILE, Clock, Maker, merge_once, report, report_id
 
 from gnd.schemas.errors import SchemaError
 from gnd.tile_store.errors import StoreError
@@ -91,7 +91,7 @@ def test_reports_from_many_threads_are_all_kept_and_each_caller_hears_of_its_own
     assert store.counts().reports == 16 * 20
 
 
-def test_what_was_acknowledged_is_there_after_closing_and_opening(maker: SqliteMaker) -> None:
+def test_what_was_acknowledged_is_there_after_closing_and_opening(maker: Maker) -> None:
     first = maker.open()
     first.put_reports([report(i) for i in range(10)])
     first.close()

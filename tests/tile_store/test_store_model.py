@@ -1,14 +1,13 @@
 """The store against a plain model of it: random histories of two mergers, vehicles and an operator, step by step."""
 
-import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from store_helpers import EAGER, EAST, TILE, Clock, SqliteMaker, basis_of, report, report_id, tile_of_voxels
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+from store_helpers import EAGER, EAST, TILE, Clock, Maker, SqliteMaker, basis_of, report, report_id, tile_of_voxels
 
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.errors import UnknownVersion
@@ -58,11 +57,10 @@ def merged(tile: ModelTile) -> frozenset[int]:
 class StoreMachine(RuleBasedStateMachine):
     """Every rule acts on the store and on the model; the invariants compare the two."""
 
-    def __init__(self) -> None:
+    def __init__(self, maker: Maker) -> None:
         super().__init__()
-        self.folder = tempfile.TemporaryDirectory()
         self.clock = Clock()
-        self.maker = SqliteMaker(Path(self.folder.name) / "store.db")
+        self.maker = maker
         self.store = self.maker.open(EAGER, self.clock)
         self.tiles = {TILE: ModelTile(), EAST: ModelTile()}
         self.held: list[Held] = []
@@ -72,7 +70,6 @@ class StoreMachine(RuleBasedStateMachine):
             self.merge_the_rest()
         finally:
             self.store.close()
-            self.folder.cleanup()
 
     def merge_the_rest(self) -> None:
         """Whatever has happened: when all is merged, the map is a function of the epochs and the reports that count."""
@@ -211,7 +208,13 @@ class StoreMachine(RuleBasedStateMachine):
                 held.is_current = False
 
 
-TestStoreMachine = pytest.mark.slow(StoreMachine.TestCase)
-TestStoreMachine.settings = settings(
-    max_examples=50, stateful_step_count=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
+@pytest.mark.slow
+def test_store_and_model_agree(new_maker: Callable[[], Maker]) -> None:
+    is_file = isinstance(new_maker(), SqliteMaker)
+    tried = settings(
+        max_examples=50 if is_file else 12,
+        stateful_step_count=50,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    run_state_machine_as_test(lambda: StoreMachine(new_maker()), settings=tried)

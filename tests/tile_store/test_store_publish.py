@@ -7,7 +7,7 @@ from store_helpers import (
     EAST,
     TILE,
     Clock,
-    SqliteMaker,
+    Maker,
     merge_once,
     only_claim,
     publication,
@@ -96,7 +96,7 @@ def test_a_report_between_claim_and_load_is_merged_with_the_others(store: Store)
     assert (store.counts().waiting, store.dirty_count()) == (0, 0)
 
 
-def test_a_tile_left_dirty_waits_its_delay_again(maker: SqliteMaker, clock: Clock) -> None:
+def test_a_tile_left_dirty_waits_its_delay_again(maker: Maker, clock: Clock) -> None:
     store = maker.open(StoreConfig(merge_delay_s=2.0, merge_after_reports=9), clock)
     store.put_reports([report(1)])
     clock.advance(2.0)
@@ -203,7 +203,7 @@ def test_layers_are_apart(store: Store) -> None:
     assert [entry.version for entry in store.heads("ndt_summer")] == [1]
 
 
-def test_the_reports_of_a_feature_layer_are_cut_into_windows_by_the_time_of_day(maker: SqliteMaker) -> None:
+def test_the_reports_of_a_feature_layer_are_cut_into_windows_by_the_time_of_day(maker: Maker) -> None:
     """Neighbouring tiles, which hear the same of what lies at their border, cut alike whoever speaks first."""
     store = maker.open(StoreConfig(merge_delay_s=0.0, window_s=100.0))
     seconds = [130, 190, 199, 200, 150, 299, 305]  # one clock steps back

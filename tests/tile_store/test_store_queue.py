@@ -4,11 +4,10 @@ import threading
 from dataclasses import replace
 
 import pytest
-from store_helpers import EAGER, EAST, FAR, TILE, Clock, SqliteMaker, only_claim, publication, report
+from store_helpers import EAGER, EAST, FAR, TILE, Clock, Maker, of_a_file, only_claim, publication, report
 
 from gnd.tile_store import clocks
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import StoreConfig
 
@@ -21,7 +20,7 @@ def test_nothing_to_do_in_an_empty_store(store: Store) -> None:
     assert store.dirty_count() == 0
 
 
-def test_a_tile_is_ready_a_delay_after_its_first_report(maker: SqliteMaker, clock: Clock) -> None:
+def test_a_tile_is_ready_a_delay_after_its_first_report(maker: Maker, clock: Clock) -> None:
     store = maker.open(PATIENT, clock)
     store.put_reports([report(1)])
     clock.advance(1.5)
@@ -33,7 +32,7 @@ def test_a_tile_is_ready_a_delay_after_its_first_report(maker: SqliteMaker, cloc
     store.close()
 
 
-def test_a_tile_is_ready_at_once_when_enough_reports_wait(maker: SqliteMaker, clock: Clock) -> None:
+def test_a_tile_is_ready_at_once_when_enough_reports_wait(maker: Maker, clock: Clock) -> None:
     store = maker.open(PATIENT, clock)
     store.put_reports([report(1), report(2)])
     assert store.claim("m1", 1, 10.0) == []
@@ -42,7 +41,7 @@ def test_a_tile_is_ready_at_once_when_enough_reports_wait(maker: SqliteMaker, cl
     store.close()
 
 
-def test_what_is_half_said_waits_for_its_gaussians_but_not_for_ever(maker: SqliteMaker, clock: Clock) -> None:
+def test_what_is_half_said_waits_for_its_gaussians_but_not_for_ever(maker: Maker, clock: Clock) -> None:
     store = maker.open(PATIENT, clock)
     half = replace(report(1), is_half=True)
     store.put_reports([half])
@@ -59,7 +58,7 @@ def test_what_is_half_said_waits_for_its_gaussians_but_not_for_ever(maker: Sqlit
     store.close()
 
 
-def test_one_report_can_be_enough(maker: SqliteMaker, clock: Clock) -> None:
+def test_one_report_can_be_enough(maker: Maker, clock: Clock) -> None:
     store = maker.open(StoreConfig(merge_delay_s=60, merge_after_reports=1), clock)
     store.put_reports([report(1)])
     assert only_claim(store).tile == TILE
@@ -150,7 +149,7 @@ def test_never_more_tiles_than_asked_for(store: Store) -> None:
     assert store.claim("m1", 0, 10.0) == []
 
 
-def test_claims_of_two_owners_never_overlap(maker: SqliteMaker) -> None:
+def test_claims_of_two_owners_never_overlap(maker: Maker) -> None:
     clock = Clock()
     stores = [maker.open(EAGER, clock) for _ in range(2)]
     tiles = [TILE.neighbours()[0], TILE, *EAST.neighbours()]
@@ -190,9 +189,9 @@ def test_only_a_merge_that_was_begun_counts_as_an_attempt(store: Store) -> None:
 
 
 @pytest.mark.parametrize("step_s", [-86_400.0, 86_400.0])
-def test_the_time_of_day_may_step_and_the_queue_does_not_care(maker: SqliteMaker, step_s: float) -> None:
+def test_the_time_of_day_may_step_and_the_queue_does_not_care(maker: Maker, step_s: float) -> None:
     day, steady = Clock(), Clock()
-    with SqliteStore(maker.path, PATIENT, now_ns=day, steady_ns=steady) as store:
+    with maker.open(PATIENT, day, steady) as store:
         store.put_reports([report(1)])
         day.advance(step_s)
         assert store.claim("m1", 1, 10.0) == []
@@ -206,17 +205,18 @@ def test_the_time_of_day_may_step_and_the_queue_does_not_care(maker: SqliteMaker
         assert only_claim(store, "m2").token != claim.token
 
 
-def test_leases_and_delays_of_another_boot_are_over(maker: SqliteMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+@of_a_file
+def test_leases_and_delays_of_another_boot_are_over(maker: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
     late, early = Clock(), Clock()
     early.ns = 5_000_000_000
-    with SqliteStore(maker.path, PATIENT, steady_ns=late) as store:
+    with maker.open(PATIENT, steady=late) as store:
         store.put_reports([report(1), report(2), report(3), report(1, EAST)])
         held = only_claim(store, "dead", lease_s=600.0)
         assert [one.is_alive for one in store.shards()] == []
         store.join("alive")
         assert [one.is_alive for one in store.shards()] == [True]
     monkeypatch.setattr(clocks, "boot_id", lambda: "another")
-    with SqliteStore(maker.path, PATIENT, steady_ns=early) as store:
+    with maker.open(PATIENT, steady=early) as store:
         assert [one.is_alive for one in store.shards()] == [False]
         assert {one.tile for one in store.claim("m1", 10, 10.0)} == {TILE, EAST}
         assert store.beat("dead", [held], 10.0) == [False]

@@ -1,15 +1,19 @@
 """Uploads: kept once as they came, leased by a clock that cannot step, settled all or not at all."""
 
+import re
 import subprocess
 import sys
 import threading
 from dataclasses import replace
+from importlib.util import find_spec
 
 import pytest
-from store_helpers import TILE, Clock, SqliteMaker, report, report_id
+from store_helpers import TILE, Clock, Maker, of_a_file, report, report_id
 
-from gnd.tile_store import clocks
+from gnd.tile_store import clocks, sql_uploads
 from gnd.tile_store.errors import IdTaken, StoreError
+from gnd.tile_store.sqlite_connection import SQL
+from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.store import Store
 from gnd.tile_store.uploads import Answered, Settled, Upload, UploadClaim
 
@@ -32,6 +36,8 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine()
     monkeypatch.setattr(clocks, "steady_ns", lambda: machine.now)
     monkeypatch.setattr(clocks, "boot_id", lambda: machine.name)
+    if find_spec("psycopg"):
+        monkeypatch.setattr("gnd.tile_store.postgres_connection.DatabaseClock.steady_ns", lambda _: machine.now)
     return machine
 
 
@@ -49,6 +55,20 @@ def claimed(store: Store, owner: str = "a", n: int = 8, lease_s: float = 10.0) -
 
 def numbers(claims: list[UploadClaim]) -> list[bytes]:
     return [claim.upload.body[-1:] for claim in claims]
+
+
+@pytest.mark.parametrize("name", ["consume_reports", "still_dirty", "move_waiting"])
+@of_a_file
+def test_what_is_done_to_reports_that_wait_does_not_look_at_those_that_are_merged(store, name):
+    """Under the write lock, for which acknowledgements wait: a tile may have thousands of reports. PostgreSQL plans by
+    what is there, and takes no hints.
+    """
+    statement = SQL[name]
+    values = dict.fromkeys(re.findall(r":(\w+)", statement), 1)
+    plan = store.look(lambda c: [row[3] for row in c.execute("EXPLAIN QUERY PLAN " + statement, values)])
+    of_reports = [line for line in plan if "report" in line]
+    assert of_reports
+    assert all("INDEX report_waiting" in line for line in of_reports), plan
 
 
 def test_the_same_bytes_on_the_same_key_are_kept_once(store: Store) -> None:
@@ -88,6 +108,7 @@ def test_a_lease_ends_by_the_clock_of_the_machine_and_not_by_the_date(
     assert again.attempts == 2
 
 
+@of_a_file
 def test_a_lease_of_before_the_machine_was_started_has_ended(store: Store, machine: Machine) -> None:
     store.put_upload(flags(), "a")
     claimed(store, lease_s=3000.0)
@@ -243,11 +264,12 @@ def test_many_threads_claim_each_upload_once(store: Store) -> None:
     assert store.counts().reports == 60
 
 
-def test_uploads_survive_closing_and_opening(maker: SqliteMaker) -> None:
+def test_uploads_survive_closing_and_opening(maker: Maker) -> None:
     first = maker.open()
     first.put_upload(flags(), "a")
     first.close()
-    assert len(maker.open().claim_uploads("a", 8, 10.0)) == 1
+    with maker.open() as second:
+        assert len(second.claim_uploads("a", 8, 10.0)) == 1
 
 
 @pytest.mark.parametrize("bad", [{"vehicle": ""}, {"form": "gaussians"}, {"form": "letter"}])
@@ -262,3 +284,45 @@ def test_the_clock_of_leases_is_one_for_all_processes_of_the_machine() -> None:
     *boot, now_ns = subprocess.check_output([sys.executable, "-c", ask], text=True).split(" ")
     assert boot == [clocks.boot_id()]
     assert before_ns < int(now_ns) < clocks.steady_ns()
+
+
+def test_a_patient_upload_goes_with_the_commit_of_another(store: Store):
+    """And comes to its end alone where nobody else commits."""
+    assert store.put_upload(flags(1), "a", 0.05) == "stored"
+    done: list[str] = []
+    patient = threading.Thread(target=lambda: done.append(store.put_upload(flags(2), "a", 600.0)))
+    patient.start()
+    while not done:
+        store.put_upload(flags(3), "a")
+        patient.join(0.01)
+    patient.join(20.0)
+    assert done == ["stored"]
+
+
+def test_a_store_that_is_closed_finishes_what_is_patient(tmp_path):
+    store = SqliteStore(tmp_path / "store.sqlite")
+    done: list[str] = []
+    patient = threading.Thread(target=lambda: done.append(store.put_upload(flags(), "a", 0.3)))
+    patient.start()
+    while not store._writer._patient and not done:
+        patient.join(0.001)
+    store.close()
+    patient.join(20.0)
+    assert done == ["stored"]
+
+
+def test_no_vehicle_comes_first_because_of_its_name(store: Store, monkeypatch):
+    """Many invented names that sort before all others do not hide those from the look."""
+    monkeypatch.setattr(sql_uploads, "MOST_TURNS", 4)
+    for number in range(10):
+        store.put_upload(replace(flags(number), vehicle=f"a-{number}"), "a")
+    store.put_upload(replace(flags(10), vehicle="z"), "a")
+    seen: set[str] = set()
+
+    def in_turn(vehicles: list[str]) -> list[str]:
+        seen.update(vehicles)
+        return []
+
+    for _ in range(4):
+        assert store.claim_uploads("a", 8, 10.0, in_turn) == []
+    assert seen == {"z", *(f"a-{number}" for number in range(10))}

@@ -3,15 +3,16 @@
 import dataclasses
 import hashlib
 
-import apsw
 import pytest
 from store_helpers import (
     EAST,
     FAR,
     TILE,
     Clock,
+    Maker,
     SqliteMaker,
     merge_once,
+    of_a_file,
     only_claim,
     publication,
     report,
@@ -60,12 +61,11 @@ def test_the_stored_hash_is_that_of_the_tile_and_its_plain_columns_whatever_the_
     assert best_codec(plain.gaussians) != best_codec(rounded.gaussians)
 
 
-def test_a_body_of_plain_columns_that_an_older_program_has_stored_is_read(store: Store, maker: SqliteMaker) -> None:
+def test_a_body_of_plain_columns_that_an_older_program_has_stored_is_read(store: Store, maker: Maker) -> None:
     tile = tile_of_voxels(TILE, 1, 2)
     store.put_tiles([tile])
-    with apsw.Connection(str(maker.path)) as connection:
-        row = (encode_gaussians(tile.gaussians), TILE.morton)
-        connection.execute("UPDATE tile_version SET codec_id = 0, body = ? WHERE tile = ?", row)
+    body = encode_gaussians(tile.gaussians)
+    maker.sql("UPDATE tile_version SET codec_id = 0, body = ? WHERE tile = ?", body, TILE.morton)
     old = store.get("ndt", TILE)
     assert old is not None
     assert (old.codec_id, old.sha, old.decode().gaussians) == (0, tile.sha, tile.gaussians)
@@ -308,7 +308,8 @@ def test_a_body_that_is_not_what_its_hash_says_is_found_when_it_is_decoded(store
         plain.decode()
 
 
-def test_a_backup_is_a_store_and_overwrites_nothing(store: Store, maker: SqliteMaker) -> None:
+@of_a_file
+def test_a_backup_is_a_store_and_overwrites_nothing(store: Store, maker: Maker) -> None:
     merged_versions(store, 2)
     path = maker.path.with_name("backup.db")
     store.backup(path)
@@ -349,9 +350,8 @@ def test_a_base_of_which_nobody_told_when_it_was_surveyed_has_no_day(store: Stor
     assert day_of_head(store) == UNKNOWN_DAY
 
 
-def test_a_survey_goes_with_its_version(store: Store, maker: SqliteMaker) -> None:
+def test_a_survey_goes_with_its_version(store: Store, maker: Maker) -> None:
     for k in range(4):
         store.put_tiles([tile_of_voxels(TILE, k)], surveyed_ns=1_700_000_000_000_000_000)
     store.gc(1)
-    with apsw.Connection(str(maker.path)) as connection:
-        assert connection.execute("SELECT version FROM survey").get == 4
+    assert maker.sql("SELECT version FROM survey") == [(4,)]

@@ -10,7 +10,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.ticket import TICKETS, ticket_of
 from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
 from gnd.tile_store import releasing
-from gnd.tile_store import sqlite_trials as trials
+from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.released import released, released_heads

@@ -22,11 +22,11 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.tile_store.backup import copy_store
 from gnd.tile_store.check import check_store
+from gnd.tile_store.connection import change
 from gnd.tile_store.errors import StoreDamaged, StoreError, StoreUnavailable
 from gnd.tile_store.migrations import SCHEMA_VERSION
 from gnd.tile_store.retention import Retained, retain
 from gnd.tile_store.rollback import RollbackTarget, plan, roll_back
-from gnd.tile_store.sqlite_connection import change
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoreConfig
 

@@ -137,8 +137,9 @@ def test_nothing_is_told_of_begin_and_end_wherever_a_trip_goes(
 def test_a_dozen_trips_from_one_street_show_one_circle_around_another_place(circles: Circles, tmp_path: Path) -> None:
     """Whoever lays all gaps over each other learns no more than from one of them."""
     rng, gaps = np.random.default_rng(4), []
+    spread_m = (PRIVATE_OFF - DRAWN_OFF) * RADIUS_M / (2 * math.sqrt(2))  # so that any circle of one stands for all
     for _ in range(12):
-        trip = Trip(Circles(tmp_path / "private_places.json", RADIUS_M), tuple(rng.uniform(-17.0, 17.0, 2)))
+        trip = Trip(Circles(tmp_path / "private_places.json", RADIUS_M), tuple(rng.uniform(-spread_m, spread_m, 2)))
         angle = rng.uniform(0, 2 * math.pi)
         trip.drive_to(700.0 * math.cos(angle), 700.0 * math.sin(angle))
         trip.drive_to(700.0, 0.0)

@@ -24,7 +24,7 @@ from gnd.tile_store.feature_io.stored import load_features, sources_of
 from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions, MapFeature
 from gnd.tile_store.feature_io.whole_file import write_whole
 from gnd.tile_store.feature_io.xml_spans import read_bytes
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqlStore
 
 Format = Literal["lanelet2", "opendrive", "geojson", "argoverse2"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
@@ -92,7 +92,7 @@ class FeaturesExported:
 
 
 def export_features(
-    store: SqliteStore,
+    store: SqlStore,
     path: Path,
     layers: Sequence[str] = (),
     region: str = "",
@@ -115,12 +115,12 @@ def export_features(
     kept = None if found == "geojson" else _source(store, found, source, chosen=bool(layers or region))
     if found == OPENDRIVE and kept is None:
         raise FeatureFileError(
-            f"{store.path}: OpenDRIVE is written into the file that the features came from, and no source is one, or a "
-            "part was chosen; write .osm (Lanelet2) or .geojson"
+            f"{store.location}: OpenDRIVE is written into the file that the features came from, and no source is one, "
+            "or a part was chosen; write .osm (Lanelet2) or .geojson"
         )
     if not features and kept is None:
         raise FeatureFileError(
-            f"{store.path}: no features in {', '.join(layers) or 'any layer'}, {region or 'everywhere'}"
+            f"{store.location}: no features in {', '.join(layers) or 'any layer'}, {region or 'everywhere'}"
         )
     if found == "geojson":
         body, changes, told = write_geojson(features), None, len(features)
@@ -134,7 +134,7 @@ def export_features(
     return FeaturesExported(str(path), found, told, len(body), kept.name if kept else None, changes)
 
 
-def _all_lanes(store: SqliteStore) -> list[MapLane]:
+def _all_lanes(store: SqlStore) -> list[MapLane]:
     """The lanes of all sources; their keys are made different, because two files may use one."""
     found = []
     for name, source in sources_of(store).items():
@@ -145,15 +145,15 @@ def _all_lanes(store: SqliteStore) -> list[MapLane]:
     return found
 
 
-def _source(store: SqliteStore, format_: str, said: str | None, *, chosen: bool) -> FeatureSource | None:
+def _source(store: SqlStore, format_: str, said: str | None, *, chosen: bool) -> FeatureSource | None:
     known = {name: one for name, one in sources_of(store).items() if one.format == format_}
     if said == "" or (said is None and (not known or chosen)):
         return None
     if said is None and len(known) > 1:
-        raise FeatureFileError(f"{store.path}: features come from {', '.join(known)}; say which with --source")
+        raise FeatureFileError(f"{store.location}: features come from {', '.join(known)}; say which with --source")
     name = said if said is not None else next(iter(known))
     if name not in known:
-        raise FeatureFileError(f"{store.path}: no {format_} file {name!r:.80}; it has {', '.join(known) or 'none'}")
+        raise FeatureFileError(f"{store.location}: no {format_} file {name!r:.80}; it has {', '.join(known) or 'none'}")
     if chosen:
         raise FeatureFileError(
             f"{name}: with --source all layers and regions are written; choose a new file: --source ''"
@@ -162,7 +162,7 @@ def _source(store: SqliteStore, format_: str, said: str | None, *, chosen: bool)
 
 
 def _lanelet2(
-    store: SqliteStore, features: list[MapFeature], kept: FeatureSource | None
+    store: SqlStore, features: list[MapFeature], kept: FeatureSource | None
 ) -> tuple[bytes, Changes | None, int]:
     """The file with its own features and new ones; those of other files stay out."""
     if kept is None:
@@ -173,7 +173,7 @@ def _lanelet2(
     return body, changes, len(mine)
 
 
-def _without_foreign(store: SqliteStore, features: list[MapFeature], kept: FeatureSource) -> list[MapFeature]:
+def _without_foreign(store: SqlStore, features: list[MapFeature], kept: FeatureSource) -> list[MapFeature]:
     """The features that are a source's own or no source's."""
     others = (one for name, one in sources_of(store).items() if name != kept.name)
     foreign = {id_ for other in others for ids in other.ids.values() for id_ in ids}

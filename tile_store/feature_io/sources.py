@@ -10,14 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import apsw
 import zstandard
 
 from gnd.gnd_map.bounded import json_value, zstd_unpacked
+from gnd.tile_store.connection import SqlConnection, change, fetch
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.feature_io.errors import FeatureFileError
 from gnd.tile_store.feature_io.lane_network import MapLane, lane_of
-from gnd.tile_store.sqlite_connection import change, fetch
 
 MAX_DOCUMENT_BYTES: Final = 1_000_000_000
 _LEVEL: Final = 9
@@ -43,25 +42,18 @@ class FeatureSource:
             raise FeatureFileError(f"a source's name has 1 … 200 characters, got {len(self.name)}")
 
 
-def put_source(c: apsw.Connection, source: FeatureSource, now_ns: int) -> None:
+def put_source(c: SqlConnection, source: FeatureSource, now_ns: int) -> None:
     """Keep a source in place of one of the same name; inside the caller's transaction."""
     ids = {layer: list(numbers) for layer, numbers in source.ids.items()}
     lanes = [lane.as_list() for lane in source.lanes]
     about = {"format": source.format, "options": dict(source.options), "ids": ids, "lanes": lanes}
-    c.execute("CREATE TABLE IF NOT EXISTS " + TABLE)
+    change(c, "make_feature_source", {})
     body = zstandard.compress(source.document, _LEVEL)
     row = {"name": source.name, "created_ns": now_ns, "about": json.dumps(about), "body": body}
     change(c, "put_feature_source", row)
 
 
-TABLE: Final = (
-    "feature_source (name TEXT NOT NULL PRIMARY KEY, created_ns INTEGER NOT NULL, about TEXT NOT NULL, "
-    "body BLOB NOT NULL) STRICT"
-)
-"""Made with the first import: stores without one are as they were."""
-
-
-def get_sources(c: apsw.Connection) -> list[FeatureSource]:
+def get_sources(c: SqlConnection) -> list[FeatureSource]:
     """All sources, sorted by name."""
     if not fetch(c, "feature_source_exists"):
         return []

@@ -4,20 +4,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import apsw
-
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.features import MAX_FEATURES_OF_TILE, Feature, FeatureTile, is_feature_layer
 from gnd.gnd_map.tile_id import TileId
-from gnd.tile_store import sqlite_versions as versions
+from gnd.tile_store import sql_versions as versions
+from gnd.tile_store.connection import SqlConnection, fetch
 from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
 from gnd.tile_store.feature_io.lane_network import counted
 from gnd.tile_store.feature_io.osm_document import Progress
 from gnd.tile_store.feature_io.sources import FeatureSource, get_sources, put_source
 from gnd.tile_store.feature_io.tiling import cut, whole
 from gnd.tile_store.feature_io.values import FeatureFile, MapFeature
-from gnd.tile_store.sqlite_connection import fetch
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.signing import Signing
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import Content, check_layer
 
 _EVERY: Final = 64
@@ -53,7 +52,7 @@ class _Put:
 
 
 def import_features(
-    store: SqliteStore,
+    store: SqlStore,
     file: FeatureFile,
     source: str,
     options: Mapping[str, Any] | None = None,
@@ -86,8 +85,8 @@ def import_features(
     new = FeatureSource(source, file.format, ids, options or {}, file.document or b"", file.lanes)
     kept = _kept(new, known.get(source))
 
-    def work(c: apsw.Connection, now: int) -> int:
-        published = sum(_put(c, one, now) for one in puts)
+    def work(c: SqlConnection, now: int) -> int:
+        published = sum(_put(c, one, now, store.signing) for one in puts)
         put_source(c, kept, now)
         return published
 
@@ -105,7 +104,7 @@ def _kept(new: FeatureSource, before: FeatureSource | None) -> FeatureSource:
     return FeatureSource(new.name, before.format, new.ids, before.options, before.document, before.lanes)
 
 
-def _put(c: apsw.Connection, one: _Put, now: int) -> bool:
+def _put(c: SqlConnection, one: _Put, now: int, signing: Signing | None) -> bool:
     rows = fetch(c, "head", {"layer": one.layer, "tile": one.tile.tile_id.morton})
     head = int(rows[0][0]) if rows else 0
     if head != one.over:
@@ -113,7 +112,8 @@ def _put(c: apsw.Connection, one: _Put, now: int) -> bool:
             f"tile {one.tile.tile_id.path} of layer {one.layer} went from version {one.over} to {head} during the "
             "import; nothing was imported, try again"
         )
-    return versions.put_base(c, one.layer, one.tile.tile_id, one.content, "base", now).status == "published"
+    put = versions.put_base(c, one.layer, one.tile.tile_id, one.content, "base", now, signing=signing)
+    return put.status == "published"
 
 
 def _refuse_foreign(file: FeatureFile, source: str, known: Mapping[str, FeatureSource]) -> None:
@@ -131,7 +131,7 @@ def _refuse_foreign(file: FeatureFile, source: str, known: Mapping[str, FeatureS
 
 
 def _puts(
-    store: SqliteStore, file: FeatureFile, old: Mapping[str, Sequence[int]], progress: Progress | None
+    store: SqlStore, file: FeatureFile, old: Mapping[str, Sequence[int]], progress: Progress | None
 ) -> tuple[list[_Put], int]:
     """The tiles as they will be, and how many features of the source go."""
     new = cut(file.features, len(file.features), progress)
@@ -150,7 +150,7 @@ def _puts(
     return puts, gone
 
 
-def _tile(store: SqliteStore, layer: str, tile: TileId, features: list[Feature], ours: set[int]) -> _Put:
+def _tile(store: SqlStore, layer: str, tile: TileId, features: list[Feature], ours: set[int]) -> _Put:
     stored = store.get(layer, tile)
     kept = [] if stored is None else [f for f in stored.decode_features().features if f.feature_id not in ours]
     n = len(kept) + len(features)
@@ -163,27 +163,27 @@ def _tile(store: SqliteStore, layer: str, tile: TileId, features: list[Feature],
         raise BadGeometry(f"tile {tile.path} of layer {layer}: {error}") from None
 
 
-def _tiles_with(store: SqliteStore, layer: str, ids: set[int]) -> dict[TileId, FeatureTile]:
+def _tiles_with(store: SqlStore, layer: str, ids: set[int]) -> dict[TileId, FeatureTile]:
     return {one.tile_id: one for one in layer_tiles(store, layer) if any(f.feature_id in ids for f in one.features)}
 
 
-def layer_tiles(store: SqliteStore, layer: str) -> list[FeatureTile]:
+def layer_tiles(store: SqlStore, layer: str) -> list[FeatureTile]:
     """The newest versions of the tiles of a feature layer."""
     stored = (store.get(layer, entry.tile, entry.version) for entry in store.heads(layer))
     return [one.decode_features() for one in stored if one is not None]
 
 
-def sources_of(store: SqliteStore) -> dict[str, FeatureSource]:
+def sources_of(store: SqlStore) -> dict[str, FeatureSource]:
     """The files that the store's features come from, by name."""
     return {source.name: source for source in store.look(get_sources)}
 
 
-def feature_layers(store: SqliteStore) -> list[str]:
+def feature_layers(store: SqlStore) -> list[str]:
     """The store's layers that hold features."""
     return [layer for layer in store.layers() if is_feature_layer(layer)]
 
 
-def load_features(store: SqliteStore, layers: Iterable[str] = (), region: str = "") -> list[MapFeature]:
+def load_features(store: SqlStore, layers: Iterable[str] = (), region: str = "") -> list[MapFeature]:
     """The features of layers (none named: of all feature layers), whole, that touch a region (a prefix of tile paths).
 
     Raises:
@@ -192,7 +192,7 @@ def load_features(store: SqliteStore, layers: Iterable[str] = (), region: str = 
     there, wanted = feature_layers(store), list(layers)
     absent = [layer for layer in wanted if check_layer(layer) not in there]
     if absent:
-        raise FeatureFileError(f"{store.path}: no feature layer {absent[0]!r}; it has {', '.join(there) or 'none'}")
+        raise FeatureFileError(f"{store.location}: no feature layer {absent[0]!r}; it has {', '.join(there) or 'none'}")
     tiles = {layer: layer_tiles(store, layer) for layer in wanted or there}
     prefix = region.replace("/", "")
     inside = {

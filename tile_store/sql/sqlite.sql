@@ -248,12 +248,32 @@ SELECT MAX(seq) FROM report WHERE layer = :layer AND tile = :tile
 INSERT INTO journal (layer, tile, seq, window, opened_ns) VALUES (:layer, :tile, :seq, :window, :opened_ns)
 ON CONFLICT (layer, tile) DO UPDATE SET seq = excluded.seq, window = excluded.window, opened_ns = excluded.opened_ns
 
--- name: window_size
-SELECT COUNT(*), COUNT(DISTINCT vehicle), COALESCE(MAX(vehicle = :vehicle), 0) FROM report
-WHERE layer = :layer AND tile = :tile AND window = :window
+-- name: place_in_journal
+-- Newest number and open window of a tile's journal, since when it is open; how many reports stand in it; how many vehicles,
+-- but 0 where this one is among them; and whose the report is that has this key (NULL: it is new).
+SELECT j.seq, j.window, j.opened_ns,
+  (SELECT COUNT(*) FROM report AS r INDEXED BY report_window
+   WHERE r.layer = j.layer AND r.tile = j.tile AND r.window = j.window),
+  (SELECT CASE WHEN MAX(r.vehicle = :vehicle) THEN 0 ELSE COUNT(DISTINCT r.vehicle) END
+   FROM report AS r INDEXED BY report_window WHERE r.layer = j.layer AND r.tile = j.tile AND r.window = j.window),
+  (SELECT vehicle FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id AND part = :part)
+FROM journal AS j WHERE j.layer = :layer AND j.tile = :tile
+
+-- name: place_without_journal
+-- The same of a tile that has none yet: newest number, and whose the report is.
+SELECT COALESCE(MAX(seq), 0), MAX(CASE WHEN report_id = :report_id AND part = :part THEN vehicle END) FROM report
+WHERE layer = :layer AND tile = :tile
+
+-- name: confirmed_version
+-- The newest version, where it has this content and nothing waits to be merged or to be confirmed by others.
+SELECT version FROM tile_head AS h WHERE h.layer = :layer AND h.tile = :tile AND h.sha = :base_sha
+  AND NOT EXISTS (SELECT 1 FROM dirty AS d WHERE d.layer = h.layer AND d.tile = h.tile)
+  AND NOT EXISTS (SELECT 1 FROM waiting_change AS w WHERE w.layer = h.layer AND w.tile = h.tile
+                  AND w.reason IN ('share', 'contradicted') AND w.voxels >= :least)
 
 -- name: move_waiting
-UPDATE report SET window = :window WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND window >= 0
+UPDATE report INDEXED BY report_waiting SET window = :window
+WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND window >= 0
 
 -- name: oldest_of_window
 SELECT MIN(received_ns) FROM report WHERE layer = :layer AND tile = :tile AND window = :window
@@ -366,6 +386,130 @@ GROUP BY r.layer, r.tile
 -- name: oldest_since_epoch
 SELECT MIN(seq) FROM report WHERE layer = :layer AND tile = :tile AND window >= :first
 
+-- name: standings_of_tile
+SELECT window, vehicle, at_ns, day, alone, shared, judged, denied, unheard FROM standing
+WHERE layer = :layer AND tile = :tile AND window >= :first
+
+-- name: put_standing
+INSERT INTO standing (layer, tile, window, vehicle, at_ns, day, alone, shared, judged, denied, unheard)
+VALUES (:layer, :tile, :window, :vehicle, :at_ns, :day, :alone, :shared, :judged, :denied, :unheard)
+ON CONFLICT (layer, tile, window, vehicle) DO UPDATE
+SET at_ns = excluded.at_ns, day = excluded.day, alone = excluded.alone, shared = excluded.shared,
+    judged = excluded.judged, denied = excluded.denied, unheard = excluded.unheard
+
+-- name: delete_standing
+DELETE FROM standing WHERE layer = :layer AND tile = :tile AND window = :window AND vehicle = :vehicle
+
+-- name: standings_of_vehicle
+SELECT judged, denied FROM standing
+WHERE vehicle = :vehicle AND judged > 0 AND at_ns > COALESCE((SELECT until_ns FROM pardon WHERE vehicle = :vehicle), -1)
+ORDER BY at_ns DESC, layer, tile, window LIMIT :n
+
+-- name: unheard_vehicles
+SELECT vehicle, COUNT(*) FROM standing WHERE unheard > 0 GROUP BY vehicle ORDER BY vehicle
+
+-- name: newest_standing
+SELECT COALESCE(MAX(at_ns), 0) FROM standing WHERE vehicle = :vehicle
+
+-- name: add_alone
+INSERT INTO alone_day (vehicle, day, owner, alone, shared) VALUES (:vehicle, :day, :owner, :alone, :shared)
+ON CONFLICT (vehicle, day) DO UPDATE
+SET alone = alone_day.alone + excluded.alone, shared = alone_day.shared + excluded.shared
+
+-- name: alone_of_owner
+SELECT vehicle, alone, shared FROM alone_day WHERE day = :day AND owner = :owner AND alone > 0 ORDER BY vehicle
+
+-- name: alone_of_vehicle
+SELECT owner, alone, shared FROM alone_day WHERE day = :day AND vehicle = :vehicle
+
+-- name: days_alone
+SELECT vehicle, day, alone, shared FROM alone_day WHERE alone > 0 ORDER BY vehicle, day
+
+-- name: lone_words_of_vehicle
+SELECT day, since_ns, why FROM lone_word WHERE vehicle = :vehicle ORDER BY day
+
+-- name: lone_words
+SELECT vehicle, day, since_ns, why FROM lone_word ORDER BY vehicle, day
+
+-- name: lone_words_of_tile
+SELECT DISTINCT w.vehicle, w.day FROM lone_word AS w JOIN report AS r ON r.vehicle = w.vehicle
+WHERE r.layer = :layer AND r.tile = :tile
+
+-- name: vehicles_of_tile
+SELECT DISTINCT vehicle FROM report WHERE layer = :layer AND tile = :tile
+
+-- name: put_lone_word
+INSERT INTO lone_word (vehicle, day, since_ns, why) VALUES (:vehicle, :day, :since_ns, :why)
+ON CONFLICT (vehicle, day) DO UPDATE SET why = excluded.why
+
+-- name: delete_lone_word
+DELETE FROM lone_word WHERE vehicle = :vehicle AND day = :day
+
+-- name: delete_lone_words
+DELETE FROM lone_word WHERE vehicle = :vehicle AND day = 0
+
+-- name: coincidences_of_tile
+SELECT one, other, shared, by_chance, least FROM coincidence WHERE layer = :layer AND tile = :tile ORDER BY one, other
+
+-- name: put_coincidence
+INSERT INTO coincidence (layer, tile, one, other, shared, by_chance, least)
+VALUES (:layer, :tile, :one, :other, :shared, :by_chance, :least)
+ON CONFLICT (layer, tile, one, other) DO UPDATE
+SET shared = excluded.shared, by_chance = excluded.by_chance, least = excluded.least
+
+-- name: delete_coincidence
+DELETE FROM coincidence WHERE layer = :layer AND tile = :tile AND one = :one AND other = :other
+
+-- name: coincidence_of_pair
+SELECT COALESCE(SUM(shared), 0), COALESCE(SUM(by_chance), 0.0), COALESCE(SUM(least), 0) FROM coincidence
+WHERE one = :one AND other = :other
+
+-- name: pairs_of_groups
+SELECT g.one, g.other, SUM(c.shared), SUM(c.by_chance) FROM vehicle_group AS g JOIN coincidence AS c USING (one, other)
+GROUP BY g.one, g.other ORDER BY g.one, g.other
+
+-- name: put_pair_of_group
+INSERT INTO vehicle_group (one, other, since_ns) VALUES (:one, :other, :since_ns) ON CONFLICT DO NOTHING
+
+-- name: delete_pair_of_group
+DELETE FROM vehicle_group WHERE one = :one AND other = :other
+
+-- name: forget_standings
+DELETE FROM standing WHERE at_ns < :before
+
+-- name: forget_days_alone
+DELETE FROM alone_day WHERE day < :before / 86400000000000
+
+-- name: forget_old_places
+DELETE FROM vehicle_place WHERE last_ns < :before
+
+-- name: forget_impossible
+DELETE FROM impossible_place WHERE at_ns < :before
+
+-- name: places_of_vehicle
+SELECT report_id, last_ns, west, south, east, north FROM vehicle_place WHERE vehicle = :vehicle
+ORDER BY last_ns DESC, report_id LIMIT :n
+
+-- name: put_place
+INSERT INTO vehicle_place (vehicle, report_id, last_ns, west, south, east, north)
+VALUES (:vehicle, :report_id, :last_ns, :west, :south, :east, :north)
+ON CONFLICT (vehicle, report_id) DO NOTHING
+
+-- name: forget_places
+DELETE FROM vehicle_place WHERE vehicle = :vehicle AND last_ns < :before
+
+-- name: put_impossible
+INSERT INTO impossible_place (vehicle, times, since_ns, at_ns, why) VALUES (:vehicle, 1, :now, :now, :why)
+ON CONFLICT (vehicle) DO UPDATE
+SET times = impossible_place.times + 1, at_ns = excluded.at_ns, why = excluded.why
+
+-- name: impossible_places
+SELECT vehicle, times, since_ns, at_ns, why FROM impossible_place ORDER BY vehicle
+
+-- name: refuted_tests
+SELECT layer, tile, report_id, vehicle FROM agreement_test WHERE refuted = 1
+ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
+
 -- name: judged_vehicles
 SELECT vehicle FROM agreement_test UNION SELECT vehicle FROM quarantined_vehicle ORDER BY vehicle
 
@@ -378,6 +522,30 @@ ON CONFLICT (vehicle) DO UPDATE SET source = excluded.source, why = excluded.why
 
 -- name: release_vehicle
 DELETE FROM quarantined_vehicle WHERE vehicle = :vehicle AND (source = 'agreement' OR :any)
+
+-- name: put_owner
+INSERT INTO vehicle_owner (vehicle, since_ns, owner)
+SELECT :vehicle, :since_ns, :owner
+WHERE :owner <> COALESCE((SELECT owner FROM vehicle_owner WHERE vehicle = :vehicle AND since_ns <= :since_ns
+                          ORDER BY since_ns DESC LIMIT 1), '')
+ON CONFLICT DO NOTHING
+
+-- name: owners_of
+SELECT vehicle, since_ns, owner FROM vehicle_owner WHERE vehicle IN (SELECT value FROM json_each(:ids))
+ORDER BY vehicle, since_ns
+
+-- name: owner_now
+SELECT vehicle, since_ns, owner FROM vehicle_owner WHERE vehicle = :vehicle ORDER BY since_ns
+
+-- name: owner_too
+INSERT INTO vehicle_owner (vehicle, since_ns, owner)
+SELECT :name, CASE WHEN since_ns = (SELECT MIN(since_ns) FROM vehicle_owner WHERE vehicle = :vehicle) THEN 0
+                   ELSE since_ns END, owner
+FROM vehicle_owner WHERE vehicle = :vehicle
+ON CONFLICT DO NOTHING
+
+-- name: erase_owner
+DELETE FROM vehicle_owner WHERE vehicle = :vehicle
 
 -- name: pardon_vehicle
 INSERT INTO pardon (vehicle, until_ns) VALUES (:vehicle, :until_ns)
@@ -399,10 +567,6 @@ SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING 
 WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
   AND r.window > COALESCE(m.window, -1)
 
--- name: much_waits
-SELECT 1 FROM waiting_change
-WHERE layer = :layer AND tile = :tile AND reason IN ('share', 'contradicted') AND voxels >= :least LIMIT 1
-
 -- name: delete_waiting
 DELETE FROM waiting_change WHERE layer = :layer AND tile = :tile
 
@@ -423,10 +587,27 @@ SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change 
 -- name: dirty_tiles
 SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty WHERE aside_ns IS NULL ORDER BY layer, tile
 
--- name: insert_report
+-- name: queued_tiles
+SELECT tile, COALESCE(aside_reason, 'is waiting to be merged') FROM dirty
+
+-- name: unmerged_reports
+SELECT tile, COUNT(*) FROM report WHERE merged_in IS NULL GROUP BY layer, tile
+
+-- name: enter_report
+-- A new report at its place in the journal; its tile is to be merged, unless it is settled already (`merged_in`, else 0).
 INSERT INTO report (layer, tile, report_id, part, vehicle, received_ns, seq, window, merged_in, base_sha, body)
-VALUES (:layer, :tile, :report_id, :part, :vehicle, :received_ns, :seq, :window, :merged_in, :base_sha, :body)
-ON CONFLICT (layer, tile, report_id, part) DO NOTHING
+VALUES (:layer, :tile, :report_id, :part, :vehicle, :received_ns, :seq, :window, NULLIF(:merged_in, 0), :base_sha, :body);
+INSERT INTO journal (layer, tile, seq, window, opened_ns) VALUES (:layer, :tile, :seq, :window, :opened_ns)
+ON CONFLICT (layer, tile) DO UPDATE SET seq = excluded.seq, window = excluded.window, opened_ns = excluded.opened_ns;
+INSERT INTO dirty (layer, tile, seq, waiting, ready_ns)
+SELECT :layer, :tile, :seq, 1, CASE WHEN :merge_after <= 1 THEN :steady ELSE :steady + :delay END WHERE :merged_in = 0
+ON CONFLICT (layer, tile) DO UPDATE SET
+  seq = excluded.seq,
+  waiting = waiting + 1,
+  ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :steady ELSE :steady + :delay END),
+  attempts = CASE WHEN aside_ns IS NULL THEN attempts ELSE 0 END,
+  aside_ns = NULL,
+  aside_reason = NULL
 
 -- name: mark_dirty
 INSERT INTO dirty (layer, tile, seq, waiting, ready_ns)
@@ -481,8 +662,10 @@ DELETE FROM dirty WHERE layer = :layer AND tile = :tile AND seq <= :seq
 
 -- name: still_dirty
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, attempts = 0,
-  waiting = (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL),
-  ready_ns = CASE WHEN (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL)
+  waiting = (SELECT COUNT(*) FROM report INDEXED BY report_waiting
+             WHERE layer = :layer AND tile = :tile AND merged_in IS NULL),
+  ready_ns = CASE WHEN (SELECT COUNT(*) FROM report INDEXED BY report_waiting
+             WHERE layer = :layer AND tile = :tile AND merged_in IS NULL)
                        >= :merge_after THEN :steady ELSE :steady + :delay END
 WHERE layer = :layer AND tile = :tile
 
@@ -494,9 +677,9 @@ SELECT created_ns FROM tile_version WHERE layer = :layer AND tile = :tile ORDER 
 
 -- name: insert_version
 INSERT INTO tile_version (layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, size_bytes,
-                          provenance, body)
+                          provenance, body, signer, signed_s, signature)
 VALUES (:layer, :tile, :version, :parent, :kind, :created_ns, :merger, :n_reports, :sha, :codec_id, :size_bytes,
-        :provenance, :body)
+        :provenance, :body, :signer, :signed_s, :signature)
 
 -- name: insert_head
 INSERT INTO tile_head (layer, tile, version, epoch, sha) VALUES (:layer, :tile, :version, :epoch, :sha)
@@ -516,24 +699,27 @@ DELETE FROM notice WHERE layer = :layer AND tile = :tile AND version = :version
 SELECT layer, tile, version FROM notice WHERE created_ns <= :before ORDER BY created_ns, layer, tile, version LIMIT :n
 
 -- name: stored_version
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, signer,
+       signed_s, signature
 FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND version = :version
 
 -- name: stored_head
 SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body,
-       s.surveyed_ns
+       s.surveyed_ns, v.signer, v.signed_s, v.signature
 FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
   LEFT JOIN survey AS s USING (layer, tile, version)
 WHERE h.layer = :layer AND h.tile = :tile
 
 -- name: stored_at
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, signer,
+       signed_s, signature
 FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND created_ns <= :at_ns ORDER BY version DESC LIMIT 1
 
 -- name: stored_by_sha
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, signer,
+       signed_s, signature
 FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND sha = :sha ORDER BY version DESC LIMIT 1
 
@@ -600,10 +786,19 @@ RETURNING size_bytes
 
 -- name: counts
 SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COUNT(*) FROM tile_version),
-       (SELECT COUNT(*) FROM (SELECT DISTINCT report_id FROM report)), (SELECT COUNT(*) FROM report),
+       (SELECT COUNT(*) FROM (SELECT DISTINCT report_id FROM report) AS ids), (SELECT COUNT(*) FROM report),
        (SELECT COUNT(*) FROM report WHERE merged_in IS NULL),
        (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL), (SELECT COUNT(*) FROM quarantine),
        (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NOT NULL)
+
+-- name: make_feature_source
+-- Made with the first import: stores without one are as they were.
+CREATE TABLE IF NOT EXISTS feature_source (
+  name       TEXT    NOT NULL PRIMARY KEY,
+  created_ns INTEGER NOT NULL,
+  about      TEXT    NOT NULL,
+  body       BLOB    NOT NULL
+) STRICT
 
 -- name: put_feature_source
 INSERT INTO feature_source (name, created_ns, about, body) VALUES (:name, :created_ns, :about, :body)
@@ -654,7 +849,8 @@ ON CONFLICT (sha) DO NOTHING
 
 -- name: turns_of_uploads
 WITH RECURSIVE turn (vehicle) AS (
-  SELECT MIN(vehicle) FROM upload INDEXED BY upload_turn WHERE state = 'waiting' AND attempts = 0
+  SELECT MIN(vehicle) FROM upload INDEXED BY upload_turn
+  WHERE state = 'waiting' AND attempts = 0 AND vehicle >= :after
   UNION ALL
   SELECT (SELECT MIN(vehicle) FROM upload INDEXED BY upload_turn
           WHERE state = 'waiting' AND attempts = 0 AND vehicle > turn.vehicle)
@@ -673,15 +869,23 @@ SELECT 1 FROM upload INDEXED BY upload_fresh WHERE state = 'waiting' AND attempt
 
 -- name: waiting_of_vehicle
 SELECT COUNT(*) FROM (SELECT 1 FROM upload INDEXED BY upload_turn
-                      WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle LIMIT :n)
+                      WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle LIMIT :n) AS found
 
 -- name: waiting_of_all
-SELECT COUNT(*) FROM (SELECT 1 FROM upload INDEXED BY upload_waiting WHERE state = 'waiting' LIMIT :n)
+SELECT COUNT(*) FROM (SELECT 1 FROM upload INDEXED BY upload_waiting WHERE state = 'waiting' LIMIT :n) AS found
 
 -- name: free_uploads
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_waiting
 WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) AND attempts >= :attempts
 ORDER BY attempts, upload LIMIT :n
+
+-- name: any_free_upload
+SELECT 1 FROM upload INDEXED BY upload_waiting
+WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) LIMIT 1
+
+-- name: any_upload_left_behind
+SELECT 1 FROM upload INDEXED BY upload_waiting
+WHERE state = 'waiting' AND attempts >= 1 AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) LIMIT 1
 
 -- name: lease_upload
 UPDATE upload SET owner = :owner, token = :token, boot = :boot, lease_ns = :lease_ns, attempts = attempts + 1
@@ -838,6 +1042,10 @@ SELECT (SELECT MIN(ready_ns) FROM dirty WHERE aside_ns IS NULL
 SELECT h.tile, v.version, v.created_ns, v.codec_id, v.size_bytes
 FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
 WHERE h.layer = :layer AND h.tile >= :first AND h.tile < :end ORDER BY h.tile
+
+-- name: signed_heads
+SELECT h.tile, v.signature FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
+WHERE h.layer = :layer AND h.tile >= :first AND h.tile < :end
 
 -- name: version_at
 SELECT version FROM tile_version WHERE layer = :layer AND tile = :tile AND created_ns <= :at_ns
@@ -1009,6 +1217,89 @@ CREATE TABLE IF NOT EXISTS pardon (
   until_ns INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 
+-- name: schema_of_owners
+-- Step of the schema. Whose a vehicle is (a digest), as its certificate says, and from when on: a report counts as of who
+-- owned its vehicle when it came.
+CREATE TABLE vehicle_owner (
+  vehicle  TEXT    NOT NULL,
+  since_ns INTEGER NOT NULL,
+  owner    TEXT    NOT NULL,
+  PRIMARY KEY (vehicle, since_ns)
+) STRICT, WITHOUT ROWID;
+
+-- name: schema_of_standings
+-- Step of the schema. How vehicles stand in windows of tiles; what each has changed alone on a day; who is not believed
+-- alone (day 0: on none in particular); whose refuted claims coincide; where vehicles were last, in tiles, and who said to
+-- have been where nobody can have been.
+CREATE TABLE standing (
+  layer   TEXT    NOT NULL,
+  tile    INTEGER NOT NULL,
+  window  INTEGER NOT NULL,
+  vehicle TEXT    NOT NULL,
+  at_ns   INTEGER NOT NULL,
+  day     INTEGER NOT NULL,
+  alone   INTEGER NOT NULL,
+  shared  INTEGER NOT NULL,
+  judged  INTEGER NOT NULL,
+  denied  INTEGER NOT NULL,
+  unheard INTEGER NOT NULL,
+  PRIMARY KEY (layer, tile, window, vehicle)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX standing_vehicle ON standing (vehicle, at_ns);
+CREATE INDEX standing_time ON standing (at_ns);
+CREATE TABLE alone_day (
+  vehicle TEXT    NOT NULL,
+  day     INTEGER NOT NULL,
+  owner   TEXT    NOT NULL,
+  alone   INTEGER NOT NULL,
+  shared  INTEGER NOT NULL,
+  PRIMARY KEY (vehicle, day)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX alone_day_owner ON alone_day (day, owner);
+CREATE TABLE lone_word (
+  vehicle  TEXT    NOT NULL,
+  day      INTEGER NOT NULL,
+  since_ns INTEGER NOT NULL,
+  why      TEXT    NOT NULL,
+  PRIMARY KEY (vehicle, day)
+) STRICT, WITHOUT ROWID;
+CREATE TABLE coincidence (
+  layer     TEXT    NOT NULL,
+  tile      INTEGER NOT NULL,
+  one       TEXT    NOT NULL,
+  other     TEXT    NOT NULL,
+  shared    INTEGER NOT NULL,
+  by_chance REAL    NOT NULL,
+  least     INTEGER NOT NULL,
+  PRIMARY KEY (layer, tile, one, other)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX coincidence_pair ON coincidence (one, other);
+CREATE TABLE vehicle_group (
+  one      TEXT    NOT NULL,
+  other    TEXT    NOT NULL,
+  since_ns INTEGER NOT NULL,
+  PRIMARY KEY (one, other)
+) STRICT, WITHOUT ROWID;
+CREATE TABLE vehicle_place (
+  vehicle   TEXT    NOT NULL,
+  report_id TEXT    NOT NULL,
+  last_ns   INTEGER NOT NULL,
+  west      INTEGER NOT NULL,
+  south     INTEGER NOT NULL,
+  east      INTEGER NOT NULL,
+  north     INTEGER NOT NULL,
+  PRIMARY KEY (vehicle, report_id)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX vehicle_place_time ON vehicle_place (vehicle, last_ns);
+CREATE TABLE impossible_place (
+  vehicle  TEXT    NOT NULL,
+  times    INTEGER NOT NULL,
+  since_ns INTEGER NOT NULL,
+  at_ns    INTEGER NOT NULL,
+  why      TEXT    NOT NULL,
+  PRIMARY KEY (vehicle)
+) STRICT, WITHOUT ROWID;
+
 -- name: schema_of_turns
 -- Step of the schema: uploads that nobody has looked at, by vehicle, to look at those of all vehicles in turn.
 CREATE INDEX upload_turn ON upload (vehicle, upload) WHERE state = 'waiting' AND attempts = 0;
@@ -1171,6 +1462,7 @@ WHERE layer = :layer AND tile = :tile AND report_id = :report_id ORDER BY part
 
 -- name: is_counted_out
 SELECT 1 FROM quarantined_vehicle WHERE vehicle = :vehicle UNION ALL SELECT 1 FROM shifted_vehicle WHERE vehicle = :vehicle
+UNION ALL SELECT 1 FROM lone_word WHERE vehicle = :vehicle
 
 -- name: count_out_too
 INSERT INTO quarantined_vehicle (vehicle, since_ns, source, why)
@@ -1279,6 +1571,51 @@ SELECT COUNT(*) FROM road_part WHERE vehicle = :vehicle
 -- name: erase_road_parts
 DELETE FROM road_part WHERE vehicle = :vehicle
 
+-- name: count_standings
+SELECT COUNT(*) FROM standing WHERE vehicle = :vehicle
+
+-- name: erase_standings
+DELETE FROM standing WHERE vehicle = :vehicle
+
+-- name: count_days_alone
+SELECT COUNT(*) FROM alone_day WHERE vehicle = :vehicle
+
+-- name: erase_days_alone
+DELETE FROM alone_day WHERE vehicle = :vehicle
+
+-- name: count_coincidences
+SELECT COUNT(*) FROM coincidence WHERE one = :vehicle OR other = :vehicle
+
+-- name: erase_coincidences
+DELETE FROM coincidence WHERE one = :vehicle OR other = :vehicle
+
+-- name: count_pairs_of_groups
+SELECT COUNT(*) FROM vehicle_group WHERE one = :vehicle OR other = :vehicle
+
+-- name: erase_pairs_of_groups
+DELETE FROM vehicle_group WHERE one = :vehicle OR other = :vehicle
+
+-- name: count_places
+SELECT COUNT(*) FROM vehicle_place WHERE vehicle = :vehicle
+
+-- name: erase_places
+DELETE FROM vehicle_place WHERE vehicle = :vehicle
+
+-- name: count_impossible
+SELECT COUNT(*) FROM impossible_place WHERE vehicle = :vehicle
+
+-- name: erase_impossible
+DELETE FROM impossible_place WHERE vehicle = :vehicle
+
+-- name: count_lone_words
+SELECT COUNT(*) FROM lone_word WHERE vehicle = :vehicle
+
+-- name: erase_lone_words
+DELETE FROM lone_word WHERE vehicle = :vehicle
+
+-- name: lone_word_too
+INSERT INTO lone_word (vehicle, day, since_ns, why) SELECT :name, day, since_ns, why FROM lone_word WHERE vehicle = :vehicle
+
 -- name: erase_pardon
 DELETE FROM pardon WHERE vehicle = :vehicle
 
@@ -1299,3 +1636,92 @@ SELECT layer, tile, vehicles FROM road_tile ORDER BY layer, tile
 
 -- name: put_road_vehicles
 UPDATE road_tile SET vehicles = :vehicles WHERE layer = :layer AND tile = :tile
+
+-- name: schema_of_signatures
+-- Step of the schema. Who answers for a version: the id of the signer's certificate, when it was signed (s, POSIX time),
+-- and the signature over what `gnd.schemas.version_signature` says. The certificates are kept once each: versions stay
+-- checkable when they have ended.
+ALTER TABLE tile_version ADD COLUMN signer BLOB CHECK (signer IS NULL OR length(signer) = 8);
+ALTER TABLE tile_version ADD COLUMN signed_s INTEGER;
+ALTER TABLE tile_version ADD COLUMN signature BLOB CHECK (signature IS NULL OR length(signature) = 64);
+CREATE TABLE publisher (
+  signer  BLOB    NOT NULL PRIMARY KEY CHECK (length(signer) = 8),
+  chain   BLOB    NOT NULL,
+  since_s INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+-- name: any_publisher
+SELECT 1 FROM publisher LIMIT 1
+
+-- name: put_publisher
+INSERT INTO publisher (signer, chain, since_s) VALUES (:signer, :chain, :since_s) ON CONFLICT (signer) DO NOTHING
+
+-- name: chain_of_publisher
+SELECT chain FROM publisher WHERE signer = :signer
+
+-- name: set_signature
+UPDATE tile_version SET signer = :signer, signed_s = :signed_s, signature = :signature
+WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: unsigned_heads
+SELECT COUNT(*) FROM tile_head JOIN tile_version USING (layer, tile, version) WHERE signature IS NULL
+
+-- name: size_of_version
+SELECT size_bytes FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: schema_of_bodies
+-- Step of the schema. Where the bodies of versions lie that are empty here, and whether new ones go there; and bodies that
+-- are about to be removed there, or were lately.
+CREATE TABLE body_place (
+  number   INTEGER NOT NULL PRIMARY KEY CHECK (number = 1),
+  location TEXT    NOT NULL,
+  takes    INTEGER NOT NULL CHECK (takes IN (0, 1))
+) STRICT;
+CREATE TABLE body_going (
+  sha      BLOB    NOT NULL CHECK (length(sha) = 32),
+  codec_id INTEGER NOT NULL,
+  since_ns INTEGER NOT NULL,
+  PRIMARY KEY (sha, codec_id)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX tile_version_elsewhere ON tile_version (sha, codec_id) WHERE length(body) = 0;
+
+-- name: place_of_bodies
+SELECT location FROM body_place
+
+-- name: takes_bodies
+SELECT 1 FROM body_place WHERE takes = 1
+
+-- name: put_place_of_bodies
+INSERT INTO body_place (number, location, takes) VALUES (1, :location, :takes)
+ON CONFLICT (number) DO UPDATE SET location = excluded.location, takes = excluded.takes
+
+-- name: forget_place_of_bodies
+DELETE FROM body_place WHERE NOT EXISTS (SELECT 1 FROM tile_version WHERE length(body) = 0)
+
+-- name: names_body
+SELECT 1 FROM tile_version WHERE sha = :sha AND codec_id = :codec_id AND length(body) = 0 LIMIT 1
+
+-- name: body_going
+SELECT 1 FROM body_going WHERE sha = :sha AND codec_id = :codec_id
+
+-- name: put_body_going
+INSERT INTO body_going (sha, codec_id, since_ns) VALUES (:sha, :codec_id, :since_ns)
+ON CONFLICT (sha, codec_id) DO UPDATE SET since_ns = excluded.since_ns
+
+-- name: forget_bodies_going
+DELETE FROM body_going WHERE since_ns < :before
+
+-- name: bodies_here
+SELECT layer, tile, version, sha, codec_id, body FROM tile_version
+WHERE (layer, tile, version) > (:layer, :tile, :version) AND length(body) > 0 ORDER BY layer, tile, version LIMIT :n
+
+-- name: bodies_elsewhere
+SELECT layer, tile, version, sha, codec_id FROM tile_version
+WHERE (layer, tile, version) > (:layer, :tile, :version) AND length(body) = 0 ORDER BY layer, tile, version LIMIT :n
+
+-- name: set_body
+UPDATE tile_version SET body = :body WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: copy_has_begun
+-- Whether the store notes its changes for a copy, or has moved.
+SELECT 1 FROM sqlite_schema WHERE type = 'trigger' AND (name LIKE 'copy\_notes\_%' ESCAPE '\' OR name LIKE 'moved\_away\_%' ESCAPE '\') LIMIT 1

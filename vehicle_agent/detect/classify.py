@@ -1,7 +1,7 @@
 """From evidence to classes (GND 4.4) and to what is uploaded (GND 4.5)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from gnd.vehicle_agent.detect.extension import cells_at_half, extends_neighbour
 from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
 from gnd.vehicle_agent.detect.permeable import is_gone
 from gnd.vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
+from gnd.vehicle_agent.detect.unsure import has_met, is_unsure, told
 
 _MANY_RAYS: Final = 100
 """So many rays into a voxel without a Gaussian make too few hits a statement: by the one rule it is empty."""
@@ -29,6 +30,8 @@ class Classification:
 
     evidence: TileEvidence
     change_class: NDArray[np.uint8]
+    unsure: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(U,) rows, ascending, upon which the drive does not decide and the cloud may: it met something there."""
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -47,10 +50,16 @@ def classify(evidence: TileEvidence, parameters: DetectParameters) -> Classifica
     The state is the largest mass after Eq. (11); a voxel is new, modified or deleted when it is `changed`. `default`
     mode adds: a new Gaussian of the map's shape keeps the voxel normal, one of another shape makes even a sustained
     voxel modified (`shape_change`); deletion needs fewer hits than chance explains (`permeable`); a new Gaussian must
-    be more than the edge of a known surface (`extension`); too few hits, too few rays or a tie abstain.
+    be more than the edge of a known surface (`extension`); too few hits, too few rays or a tie abstain, and with
+    `together` what was met is told to the cloud (`unsure`).
     """
-    decide = _decide_paper if parameters.mode == "paper" else _decide_default
-    return Classification(evidence, decide(evidence, parameters).astype(np.uint8))
+    if parameters.mode == "paper":
+        return Classification(evidence, _decide_paper(evidence, parameters).astype(np.uint8))
+    found = _decide_default(evidence, parameters).astype(np.uint8)
+    if not parameters.together:
+        return Classification(evidence, found)
+    unsure = is_unsure(evidence, found == ChangeClass.NEW, found == ChangeClass.UNMEASURED)
+    return Classification(evidence, found, np.flatnonzero(unsure))
 
 
 def _state(e: TileEvidence, parameters: DetectParameters) -> NDArray[np.uint8]:
@@ -94,9 +103,13 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 
 
 def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
-    """Voxels in which the map has none: new or empty; few passes abstain, and weak hits unless many rays looked."""
+    """Voxels in which the map has none: new or empty; few passes abstain, and weak hits unless many rays looked; with
+    `together` more than a chance share of hits, too.
+    """
     weak = (e.measured.cells >= p.rules.weak_cells) & (e.n_pe + e.n_be < _MANY_RAYS)
     empty = ~weak & (e.measured.cells < _EMPTY_CELLS) & (e.n_pe >= p.rules.min_passes)
+    if p.together:
+        empty &= ~has_met(e)
     return np.select([_is_new(e, p), empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
 
 
@@ -143,6 +156,7 @@ def tile_change(found: Classification) -> TileChange:
         evidence=e.counters[rows],
         pose_sigma_m=e.pose.sigma_m,
         pose_sigma_rad=e.pose.sigma_rad,
+        unsure=told(e.measured.take(found.unsure)),
     )
 
 

@@ -87,6 +87,11 @@ class DetectParameters:
         least=10,
         most=1000,
     )
+    together: bool = setting(
+        False,
+        "Whether to tell the cloud what was met and not decided upon, which adds it up over vehicles. It helps on"
+        " motorways; where the map was made from few drives it publishes what they saw too little of.",
+    )
     own_rules: DetectRules | None = None
 
     def __post_init__(self) -> None:

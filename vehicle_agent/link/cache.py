@@ -11,8 +11,10 @@ from typing import Generic, cast
 
 from gnd.gnd_map.content import TileT, day_of_tile, encode_content, kind_of_layer
 from gnd.gnd_map.errors import GndError
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas import limits
 from gnd.schemas.tiles import TileBlob, as_kind, content_of
+from gnd.tile_client.checking import SeenVersion
 from gnd.vehicle_agent.errors import CacheError
 from gnd.vehicle_agent.link.sqlite import Database
 
@@ -27,6 +29,13 @@ CREATE TABLE IF NOT EXISTS tile (
     day      INTEGER NOT NULL DEFAULT 0,
     PRIMARY KEY (layer, morton)
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS seen (
+    layer   TEXT NOT NULL,
+    morton  INTEGER NOT NULL,
+    made_s  INTEGER NOT NULL,
+    version INTEGER NOT NULL,
+    PRIMARY KEY (layer, morton)
+) STRICT, WITHOUT ROWID;
 """
 KEEP = """
 INSERT INTO tile (layer, morton, version, sha, codec_id, body, day) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)
@@ -37,6 +46,11 @@ WHERE tile.sha = ?8 OR tile.version < excluded.version
 """
 
 
+NOTE = """
+INSERT INTO seen (layer, morton, made_s, version) VALUES (?1, ?2, ?3, ?4)
+ON CONFLICT (layer, morton) DO UPDATE SET made_s = excluded.made_s, version = excluded.version
+WHERE excluded.made_s > seen.made_s OR (excluded.made_s = seen.made_s AND excluded.version > seen.version)
+"""
 HAS_DAYS = "SELECT 1 FROM pragma_table_info('tile') WHERE name = 'day'"
 ADD_DAYS = "ALTER TABLE tile ADD COLUMN day INTEGER NOT NULL DEFAULT 0"
 """Caches of older releases have none; of what they hold the day stays unknown until it changes."""
@@ -81,6 +95,13 @@ class TileCache(Generic[TileT]):
         found = ((tile_id, self.head(tile_id)) for tile_id in tiles)
         return {tile_id: head for tile_id, head in found if head[0]}
 
+    def held_of(self, district: District) -> list[TileId]:
+        """The tiles of a district that are here, in order."""
+        first = district.first_morton
+        sql = "SELECT morton FROM tile WHERE layer = ? AND morton BETWEEN ? AND ? ORDER BY morton"
+        rows = self._db.run(sql, (self.layer, first, first + limits.MAX_TILES_OF_DISTRICT - 1))
+        return [TileId(int(morton)) for (morton,) in rows]
+
     def keep(self, blob: TileBlob, over: bytes = b"") -> bool:
         """Keep a tile as it arrived, unless something newer came meanwhile; False then, and nothing is changed.
 
@@ -96,6 +117,17 @@ class TileCache(Generic[TileT]):
         """As `keep`, for a tile that is at hand; without `blob` its body is made as small as the tile allows."""
         made = blob or TileBlob(tile.tile_id, tile.version, tile.sha, *encode_content(tile), day_of_tile(tile))
         return self.keep(made, over)
+
+    def seen(self, tile: TileId) -> SeenVersion:
+        """The newest version of a tile that one of the publishers answered for, here or not; of a cache of an older
+        release the one that is here.
+        """
+        rows = self._db.run("SELECT made_s, version FROM seen WHERE layer = ? AND morton = ?", self._of(tile))
+        return SeenVersion(*rows[0]) if rows else SeenVersion(0, self.head(tile)[0])
+
+    def note(self, tile: TileId, seen: SeenVersion) -> None:
+        """This version was seen; nothing where a newer one was. It outlives the tile itself."""
+        self._db.run(NOTE, (*self._of(tile), seen.made_s, seen.version))
 
     def drop(self, tile_id: TileId) -> None:
         """Forget a tile; not here: nothing happens."""

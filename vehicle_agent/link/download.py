@@ -11,8 +11,11 @@ from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.config import QUEUED_BATCHES
 from gnd.fleet_bus.errors import BusClosed
 from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.content import TileT
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.tile_client.archive import Archive, ArchiveTiles
+from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.exchange import Exchange, ExchangeOutcome, Fetched
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import CacheError
@@ -27,30 +30,48 @@ OFFLINE_WAIT_S = 0.5
 RETRY_S = 1.0
 """Pause before a tile that got no answer is asked for again."""
 WRONG_TRIES = 3
+MOST_DOUBLINGS = 7
+"""Of the pause, while what comes stays wrong: to a minute."""
 MOST_TILES = 1024  # of one district
 FIRST_GUESS_BYTES = 4_096
 HELD_GUESS_BYTES = 64
 
 _log = logging.getLogger(__name__)
+_SELDOM: Final = Seldom(_log)
 
 
 class TileFetcher(Generic[TileT]):
     """Worker threads that ask for the tiles that are wanted, in the order given; answers wait to be taken.
 
-    A tile is asked for once until `forget`, `refresh` or `recheck`. A tile whose content does not have its hash is
-    refused and asked for again without the cache; no answer at all gives the cached tile, if there is one, and another
-    try later. What has arrived is in the cache at once, so an agent that was killed goes on where it was.
+    A tile is asked for once until `forget`, `refresh` or `recheck`. A tile whose content does not have its hash, or
+    that nobody answers for, is refused and asked for again without the cache; no answer at all gives the cached tile,
+    if there is one, and another try later. What has arrived is in the cache at once, so an agent that was killed goes
+    on where it was.
+
+    With an archive what the cache has nothing of is brought from there first; then the bus is asked as if it had been
+    held for long: it answers with what is newer, or with nothing.
     """
 
-    def __init__(self, bus: Bus, cache: TileCache[TileT], parameters: DownloadParameters, ticket: int = 0) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        cache: TileCache[TileT],
+        parameters: DownloadParameters,
+        ticket: int = 0,
+        archive: Archive | None = None,
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self.last_error = ""
         self.link: LinkProfile = bus.config.link_profile
         self._bus, self._cache, self._parameters = bus, cache, parameters
         self._offline = False
+        self.check = VersionCheck.on_the_bus(bus, cache.layer, cache)
+        self._archive: ArchiveTiles[TileT] | None = None
+        if archive is not None:
+            self._archive = ArchiveTiles(archive, cache, self.check)
         # One attempt may take all the time there is: a second one would fetch a slow answer twice.
         self._exchange: Exchange[TileT] = Exchange(
-            bus, cache, parameters.request_s, parameters.request_s, ticket=ticket
+            bus, cache, parameters.request_s, parameters.request_s, ticket=ticket, check=self.check
         )
         rate_byte_s = self.link.rate_byte_s("down")
         self._batch_bytes = batch_bytes(rate_byte_s, DOWNLOAD_BATCH_S)
@@ -97,11 +118,15 @@ class TileFetcher(Generic[TileT]):
                 self._line_up(first=tile_id)
 
     def recheck(self, older_than_s: float = 0.0) -> None:
-        """Tiles whose answer is older may have changed unheard: ask again for those that are wanted."""
-        before_s = time.monotonic() - older_than_s
+        """Tiles whose answer is older may have changed unheard: ask again for those that are wanted.
+
+        With them goes what is half as old: it would be a question of its own soon.
+        """
+        now_s = time.monotonic()
         with self._changed:
-            old = {tile_id for tile_id in self._answered if self._answered_s.get(tile_id, 0.0) <= before_s}
-            if not old <= self._stale:
+            age_s = {tile_id: now_s - self._answered_s.get(tile_id, 0.0) for tile_id in self._answered - self._stale}
+            if max(age_s.values(), default=-1.0) >= older_than_s:
+                old = {tile_id for tile_id, one_s in age_s.items() if one_s >= older_than_s / 2}
                 self._stale |= old
                 self._line_up()
 
@@ -135,6 +160,13 @@ class TileFetcher(Generic[TileT]):
             return bool(self._cache.head(tile_id)[0])
         except CacheError:
             return False
+
+    def held_of(self, districts: Iterable[District]) -> list[TileId]:
+        """The tiles of some districts of which the cache has a version, in order."""
+        try:
+            return [tile_id for one in sorted(districts) for tile_id in self._cache.held_of(one)]
+        except CacheError:
+            return []
 
     def size_bytes(self, tile_id: TileId) -> float:
         """What the answer about a tile is likely to weigh: of one that is held little, of one not held the mean."""
@@ -217,6 +249,8 @@ class TileFetcher(Generic[TileT]):
         with self._changed:
             whole = {tile_id for tile_id in batch if self._wrong[tile_id]}
         try:
+            if self._archive is not None:
+                self._bring(self._archive, [tile_id for tile_id in batch if tile_id not in whole])
             if not self._has_router():
                 return ExchangeOutcome[TileT]()
             return self._exchange.ask(batch, whole, self._batch_bytes, near=batch[0])
@@ -225,6 +259,12 @@ class TileFetcher(Generic[TileT]):
         except Exception as error:  # whatever it was: a worker that ends would never fetch again
             self._note("failed", f"{len(batch)} tiles from {batch[0]} on: {error}")
             return ExchangeOutcome[TileT]()
+
+    def _bring(self, archive: ArchiveTiles[TileT], tiles: list[TileId]) -> None:
+        """Fill the cache from the archive, so that the bus has little to add to it, or none is needed."""
+        brought = archive.bring(tiles)
+        with self._changed:
+            self.counts["archive"] += brought
 
     def _has_router(self) -> bool:
         """Whether there is a router within a moment; else the cache has to do. Says so once."""
@@ -271,7 +311,8 @@ class TileFetcher(Generic[TileT]):
 
     def _do_without(self, tile_id: TileId, cached: TileT | None) -> None:
         """No answer: the cached tile has to do, once, and the tile is asked for again after a pause."""
-        self._not_before[tile_id] = time.monotonic() + RETRY_S
+        doublings = min(self._wrong[tile_id] // WRONG_TRIES, MOST_DOUBLINGS)
+        self._not_before[tile_id] = time.monotonic() + RETRY_S * 2 ** max(doublings - 1, 0)
         if cached is not None:
             self._stale.add(tile_id)
             self._answered.add(tile_id)
@@ -291,7 +332,7 @@ class TileFetcher(Generic[TileT]):
         with self._changed:
             self.counts[what] += 1
             self.last_error = message
-        _log.warning("%s", message)
+        _SELDOM.warning("%s", message)
 
 
 class _Mean:

@@ -18,6 +18,7 @@ from gnd.fleet_bus.bus import Bus
 from gnd.gnd_map.features import FeatureTile, is_feature_layer
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.wire import LAYER_PATTERN
+from gnd.tile_client.archive import Archive
 from gnd.tile_client.exchange import Fetched
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import AgentConfigError, CacheError
@@ -52,6 +53,7 @@ class FeatureDownloader:
         path: the cache's SQLite file; it may be that of the voxel map.
         layers: names of feature layers, each once.
         parameters: how patiently is asked; None = the defaults.
+        archive: brings what the cache has nothing of; None = the bus does.
 
     Raises:
         AgentConfigError: a layer that is none, holds Gaussians, or is named twice.
@@ -59,18 +61,25 @@ class FeatureDownloader:
     """
 
     def __init__(
-        self, bus: Bus, path: Path, layers: Sequence[str], parameters: DownloadParameters | None = None
+        self,
+        bus: Bus,
+        path: Path,
+        layers: Sequence[str],
+        parameters: DownloadParameters | None = None,
+        archive: Archive | None = None,
     ) -> None:
         _check_layers(layers)
         asked = parameters or DownloadParameters()
         few = replace(asked, in_flight=min(asked.in_flight, MOST_IN_FLIGHT))
         self._layers: dict[str, _Layer] = {}
         for layer in layers:
-            self._layers[layer] = self._opened(bus, path, layer, few)
+            self._layers[layer] = self._opened(bus, path, layer, few, archive)
 
-    def _opened(self, bus: Bus, path: Path, layer: str, parameters: DownloadParameters) -> _Layer:
+    def _opened(
+        self, bus: Bus, path: Path, layer: str, parameters: DownloadParameters, archive: Archive | None
+    ) -> _Layer:
         cache: TileCache[FeatureTile] = TileCache(path, layer)
-        fetcher = TileFetcher(bus, cache, parameters)
+        fetcher = TileFetcher(bus, cache, parameters, archive=archive)
         return _Layer(cache, fetcher, Updates(bus, cache, fetcher, lambda tile: self._renew(layer, tile)))
 
     def __enter__(self) -> Self:

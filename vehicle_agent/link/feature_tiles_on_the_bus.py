@@ -83,7 +83,8 @@ def open_feature_tiles(config: AgentConfig, link: Link, stop: threading.Event) -
         return
     if config.localise_by == "graph":
         names = list(dict.fromkeys((*names, LANES)))
-    downloader = FeatureDownloader(link.bus, config.work_dir / "features.sqlite", names, config.download)
+    path = config.work_dir / "features.sqlite"
+    downloader = FeatureDownloader(link.bus, path, names, config.download, link.archive)
     try:
         yield FeatureTilesOnTheBus(downloader, config, stop)
     finally:

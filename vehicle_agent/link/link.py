@@ -7,10 +7,13 @@ from dataclasses import dataclass
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.ledger import Ledger
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.keys import alive_key
 from gnd.schemas.ticket import ticket_of
+from gnd.tile_client.archive import Archive
+from gnd.tile_client.http_reader import HURRIED
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.link.download import TileFetcher
@@ -30,6 +33,8 @@ class Link:
     outbox: Outbox
     fetcher: TileFetcher[Tile]
     sender: SenderThread
+    archive: Archive | None = None
+    """Where tiles come from before the bus is asked; None: it is asked for all."""
 
     def traffic(self) -> dict[str, int]:
         """What this session came to, bytes; the whole of it once the link is closed."""
@@ -50,22 +55,27 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
 
     Raises:
         OutboxError, CacheError: a file cannot be opened.
+        ArchiveError: `config.tiles_from` cannot be an archive.
     """
     outbox = Outbox(config.work_dir / "outbox.sqlite")
     if config.pseudonyms is not None and (n := outbox.forget_others(config.vehicle)):
         _log.warning("%s: %d reports of an earlier name are not sent: they would link the two", config.vehicle, n)
     cache: TileCache[Tile] = TileCache(config.work_dir / "cache.sqlite", config.layer)
     ledger = Ledger(config.vehicle, config.ledger_path)
+    archive = Archive(config.tiles_from, ledger, HURRIED) if config.tiles_from else None
     bus = open_bus(BusConfig(connect=config.connect, link=config.link, patient=True), ledger, config.vehicle)
     if not bus.wait_connected(config.open_timeout_s):
         where = ", ".join(config.connect)
         _log.warning("%s: no router at %s for %g s: off on the cache", config.vehicle, where, config.open_timeout_s)
     bus.declare_alive(alive_key("agent", config.vehicle))
-    fetcher = TileFetcher(bus, cache, config.download, ticket_of(config.vehicle))
+    follow_revoked(bus)  # or versions of a publisher that was shut out would still count here
+    fetcher = TileFetcher(bus, cache, config.download, ticket_of(config.vehicle), archive)
     sender = SenderThread(bus, outbox, config.vehicle)
     try:
-        yield Link(bus, ledger, cache, outbox, fetcher, sender)
+        yield Link(bus, ledger, cache, outbox, fetcher, sender, archive)
     finally:
+        if archive is not None:
+            archive.close()
         bus.close()  # ends the requests under way, so that the threads can end
         sender.close()
         fetcher.close()

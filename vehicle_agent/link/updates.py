@@ -74,6 +74,8 @@ class Updates(Generic[TileT]):
 
     def _apply(self, update: TileUpdate) -> None:
         self.counts["received"] += 1
+        if self._fetcher.check is not None:
+            self._fetcher.check.note_announced(update.tile, update.made_s, update.version)
         version, sha = self._cache.head(update.tile)
         if version and (version >= update.version or sha == update.sha):
             return  # known already

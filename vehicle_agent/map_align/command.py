@@ -6,6 +6,7 @@ from typing import Any
 import click
 from rich.console import Console
 
+from gnd.fleet_bus.identity.options import identity_option
 from gnd.tile_store import tables
 from gnd.tile_store.cli import PATH, json_option, layer_option, show
 from gnd.tile_store.options import bars
@@ -24,6 +25,7 @@ REFUSED = 1
 @click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help="Of --out.")
 @layer_option
 @json_option
+@identity_option
 @click.pass_context
 def align(
     context: click.Context, a: Path, b: Path, out: Path | None, shift_m: float, turn_deg: float, picture: Path | None,

@@ -12,7 +12,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive_mcap import drive_counts
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.options import to_read
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.errors import VehicleError
 from gnd.vehicle_agent.map_build.build import build_recorded_map
@@ -81,7 +81,7 @@ def _kind_of(path: Path) -> Literal["map", "drive"]:
     )
 
 
-def _read(path: Path, kind: Literal["map", "drive"], store: SqliteStore, layer: str = DEFAULT_LAYER) -> Side:
+def _read(path: Path, kind: Literal["map", "drive"], store: SqlStore, layer: str = DEFAULT_LAYER) -> Side:
     tiles, surveyed = list[Tile](), list[int]()
     for entry in store.heads(layer):
         stored = store.get(layer, entry.tile)

@@ -32,13 +32,15 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
     """The first half of `report`: which voxels it flags, and where the vehicle was.
 
     Args:
-        report: as the detector makes it; what it does not flag as new, modified or deleted is not sent.
+        report: as the detector makes it; what it does not flag as new, modified or deleted, and is not unsure of, is
+            not sent.
         bases: at least those that the report's tiles name.
         track: where the vehicle was while the scans counted that the report rests on.
 
     Raises:
         PackingError: a base is missing, a changed voxel is of another class, something is held back, or the track is
             too long.
+        ShapeError: it is unsure of a voxel that its base holds.
         CodecError: the flags cannot be coded.
     """
     if track.way_m > limits.MAX_WAY_OF_REPORT_M:
@@ -46,6 +48,8 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
     doubts = [(change.tile.morton - report.district.first_morton, change.doubt) for change in report.tiles]
     if any(doubt is not None and doubt.withheld for _, doubt in doubts):
         raise PackingError(f"report {report.report_id} holds changes back: the track would call them observed")
+    unsure = [(change.tile, base_of(change, bases), change.unsure) for change in report.tiles]
+    is_unsure = any(len(measured) for _, _, measured in unsure)
     return PackedReport(
         report_id=report.report_id,
         vehicle=report.vehicle,
@@ -63,6 +67,8 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         pose_sigma_10urad=_steps_up(max(change.pose_sigma_rad for change in report.tiles), _STEPS_PER_RAD),
         doubts=tuple((index, doubt) for index, doubt in doubts if doubt is not None),
         course=report.course,
+        unsure=encode_flags([_new(*one) for one in unsure]) if is_unsure else b"",
+        unsure_measured=encode_measured([one for one in unsure if len(one[2])]) if is_unsure else b"",
     )
 
 
@@ -130,6 +136,10 @@ def _flags(change: TileChange, bases: Bases) -> Flags:
         raise PackingError(f"tile {change.tile}: changed voxels of classes {np.unique(change.change_class).tolist()}")
     voxel_id: I32 = change.changed.voxel_id
     return Flags(change.tile, base_of(change, bases), voxel_id, change.change_class)
+
+
+def _new(tile: TileId, base: Gaussians, voxels: Gaussians) -> Flags:
+    return Flags(tile, base, voxels.voxel_id, np.full(len(voxels), ChangeClass.NEW, np.uint8))
 
 
 def _steps_up(value: float, steps: int) -> int:

@@ -443,5 +443,5 @@ def statement_on_lattice(found: Classification) -> TileChange:
 
 
 def on_lattice(change: TileChange) -> TileChange:
-    """The change with its new Gaussians on the lattice "report"."""
-    return replace(change, changed=snap(change.changed, REPORT))
+    """The change with its new Gaussians, and those that it is unsure of, on the lattice "report"."""
+    return replace(change, changed=snap(change.changed, REPORT), unsure=snap(change.unsure, REPORT))

@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 
 from studies.frame.errors import FolderError
-from studies.frame.kept import Kept
+from studies.frame.kept import Kept, _files, sources_sha
+from studies.hard_cases import study as hard_cases
+from studies.localisation_study import study as localisation
 from studies.localisation_study.localising import LocalisedVariant
 from studies.localisation_study.series import PoseSeries
 from studies.localisation_study.study import RunResult
 from studies.localisation_study.trials import StartTrial
+from studies.modified_study import study as modified
+from studies.new_layer_study import study as new_layer
+from studies.new_road import study as new_road
+from studies.simulation import worlds
+from studies.slamcu_study import study as slamcu
 
 
 def series(n: int) -> PoseSeries:
@@ -51,3 +58,25 @@ def test_a_result_of_another_kind_is_named(tmp_path: Path) -> None:
     kept.write(StartTrial(1, 0.3, True, 0, 30))
     with pytest.raises(FolderError, match="lacks"):
         kept.read(RunResult)
+
+
+def test_a_source_that_is_not_there_is_named() -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        sources_sha(("vehicle_agent/tracks.py", "vehicle_agent/nowhere.py"))
+
+
+@pytest.mark.parametrize(
+    "sources",
+    [
+        *(worlds.VEHICLE, worlds.PCD, slamcu.SOURCES, new_layer.MERGE_SOURCES, localisation._RUNS, localisation._CLOUD),
+        *(hard_cases._VEHICLE, hard_cases._MAPS, modified._SIMULATED, modified._RECORDED),
+        *(new_road._BASE, new_road._DRIVE),
+    ],
+)
+def test_whatever_a_result_depends_on_is_there(sources: tuple[str, ...]) -> None:
+    assert len(sources_sha(sources)) == 64
+
+
+def test_a_simulated_vehicle_depends_on_what_it_sends() -> None:
+    names = {path.name for part in worlds.VEHICLE for path in _files(part)}
+    assert {"reporter.py", "packing.py", "classify.py", "drives.py"} <= names

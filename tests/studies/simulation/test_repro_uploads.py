@@ -13,6 +13,7 @@ from gnd.cloud_merger.merge import MergeParameters
 from gnd.schemas.changes import ChangeReport
 from studies.simulation.base_map import read_base
 from studies.simulation.cloud import arrived
+from studies.simulation.losses import analyse
 from studies.simulation.result import VehicleResult, read_result
 
 Finished = tuple[Path, dict[str, Any]]
@@ -37,6 +38,10 @@ def test_in_short_the_map_is_as_good_and_the_upload_a_fraction(finished: Finishe
     for n in ("1", "2"):
         assert 15 * short["upload_bytes"]["fleet"][n] < whole["upload_bytes"]["fleet"][n]
     assert short["parameters"]["upload"] == "packed"
+    confusion = np.array(short["confusion"]["fleet"]["2"]["all"])
+    assert confusion.tolist() != whole["confusion"]["fleet"]["2"]["all"], "else the next line shows nothing"
+    losses = analyse(other, ["2"], ["all"])["2"]["all"]
+    assert sum(loss["voxels"] for loss in losses) == confusion.sum() - np.trace(confusion)
 
 
 def test_the_cloud_holds_what_was_flagged_and_the_gaussians_that_it_asked_for(finished: Finished) -> None:

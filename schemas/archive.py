@@ -1,0 +1,272 @@
+"""A region as a static archive: names of its objects, and what its index of a district and its root say.
+
+Anything that serves files over HTTP can serve it. What never changes has a name by its content: packs (tiles, each a
+`TileReply` with its signature) and certificates. What changes is one small index a district, and the root.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import accumulate, pairwise
+from types import MappingProxyType
+from typing import Final
+
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import archive_index_pb2, archive_root_pb2
+from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
+from gnd.schemas.wire import (
+    LAYER_PATTERN,
+    MAJOR,
+    check_length,
+    check_major,
+    check_sha,
+    check_text,
+    check_version,
+    parse,
+    refusing,
+    serialise,
+)
+
+ROOT_NAME: Final = "archive.gnd"
+INDEX_FOLDER: Final = "index/"
+PACK_FOLDER: Final = "pack/"
+CERTIFICATE_FOLDER: Final = "certificate/"
+_SUFFIX: Final = ".gnd"
+SIGNED_BYTES: Final = 4
+UNSIGNED: Final = bytes(SIGNED_BYTES)
+_TILES: Final = limits.MAX_TILES_OF_DISTRICT
+
+
+def index_name(layer: str, district: District) -> str:
+    """Name of a district's index."""
+    return f"{INDEX_FOLDER}{layer}/{district.path}{_SUFFIX}"
+
+
+def place_of_index(name: str) -> tuple[str, District]:
+    """Layer and district of an index; `BadValue` where it is the name of none."""
+    layer, _, path = name.removeprefix(INDEX_FOLDER).removesuffix(_SUFFIX).partition("/")
+    with refusing(f"archive index {name[:120]!r}"):
+        check_text("layer", layer, LAYER_PATTERN)
+        district = District(path)
+        if index_name(layer, district) != name:
+            raise BadValue("no such name")
+        return layer, district
+
+
+def pack_name(sha: bytes) -> str:
+    """Name of a pack, by the SHA-256 of its bytes."""
+    return f"{PACK_FOLDER}{sha.hex()[:2]}/{sha.hex()}"
+
+
+def certificate_name(signer: bytes) -> str:
+    """Name of the certificates of somebody who has signed versions."""
+    return f"{CERTIFICATE_FOLDER}{signer.hex()}"
+
+
+@dataclass(frozen=True, slots=True)
+class Pack:
+    """An object that never changes: SHA-256 and length of its bytes."""
+
+    sha: bytes
+    size_bytes: int
+
+    def __post_init__(self) -> None:
+        check_sha("pack", self.sha)
+        if not 0 < self.size_bytes <= limits.MAX_PACK_BYTES:
+            raise BadValue(f"pack of {self.size_bytes} bytes: 1 .. {limits.MAX_PACK_BYTES}")
+
+
+@dataclass(frozen=True, slots=True)
+class ArchiveEntry:
+    """Where the newest version of a tile lies.
+
+    Attributes:
+        tile: which tile.
+        version: its number.
+        hash: first 4 bytes of its content's hash.
+        signed: first 4 bytes of its signature; zeros: nobody has signed it.
+        pack: the pack.
+        start, size: which bytes of the pack, a `TileReply`.
+    """
+
+    tile: TileId
+    version: int
+    hash: bytes
+    signed: bytes
+    pack: Pack
+    start: int
+    size: int
+
+    def __post_init__(self) -> None:
+        check_version("tile version", self.version, lowest=1)
+        if len(self.hash) != ANSWER_HASH_BYTES or len(self.signed) != SIGNED_BYTES:
+            raise BadValue(f"tile {self.tile}: {len(self.hash)} bytes of its hash, {len(self.signed)} of its signature")
+        if not 0 < self.size <= limits.MAX_TILE_REPLY_BYTES or self.start + self.size > self.pack.size_bytes:
+            raise BadValue(
+                f"tile {self.tile}: bytes {self.start} .. {self.start + self.size} of a pack of {self.pack.size_bytes}"
+            )
+
+    @property
+    def end(self) -> int:
+        """One past its last byte in the pack."""
+        return self.start + self.size
+
+
+@dataclass(frozen=True)
+class ArchiveIndex:
+    """What an archive holds of a district: one entry a tile, ascending."""
+
+    layer: str
+    district: District
+    entries: tuple[ArchiveEntry, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_text("layer", self.layer, LAYER_PATTERN)
+        check_length("ArchiveIndex", len(self.entries), _TILES, "tiles")
+        check_length("ArchiveIndex", len(self.packs), limits.MAX_PACKS_OF_DISTRICT, "packs")
+        for before, after in pairwise(self.entries):
+            if before.tile >= after.tile:
+                raise BadValue(f"ArchiveIndex lists tile {after.tile} after {before.tile}: ascending, none twice")
+        for entry in self.entries:
+            if entry.tile.district != self.district:
+                raise BadValue(f"tile {entry.tile} is not in district {self.district}")
+
+    @cached_property
+    def packs(self) -> tuple[Pack, ...]:
+        """The packs that are named, each once."""
+        return tuple(dict.fromkeys(entry.pack for entry in self.entries))
+
+    @cached_property
+    def by_tile(self) -> Mapping[TileId, ArchiveEntry]:
+        """The entries by their tiles."""
+        return MappingProxyType({entry.tile: entry for entry in self.entries})
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.ArchiveIndex."""
+        number = {pack: place for place, pack in enumerate(self.packs)}
+        places = [entry.tile.morton - self.district.first_morton for entry in self.entries]
+        message = archive_index_pb2.ArchiveIndex(
+            major=MAJOR,
+            layer=self.layer,
+            district=self.district.path,
+            packs=b"".join(pack.sha for pack in self.packs),
+            pack_bytes=[pack.size_bytes for pack in self.packs],
+            places=_steps(places),
+            versions=[entry.version for entry in self.entries],
+            hashes=b"".join(entry.hash for entry in self.entries),
+            signed=b"".join(entry.signed for entry in self.entries),
+            packs_of=[number[entry.pack] for entry in self.entries],
+            starts=[entry.start for entry in self.entries],
+            sizes=[entry.size for entry in self.entries],
+        )
+        return serialise(message, limits.MAX_ARCHIVE_INDEX_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "ArchiveIndex":
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(archive_index_pb2.ArchiveIndex, data, limits.MAX_ARCHIVE_INDEX_BYTES)
+        check_major(message, "ArchiveIndex")
+        check_length("ArchiveIndex", len(message.places), _TILES, "tiles")
+        with refusing("ArchiveIndex"):
+            district = District(message.district)
+            return cls(message.layer, district, tuple(_entries(message, district, _packs(message))))
+
+
+def _packs(message: archive_index_pb2.ArchiveIndex) -> list[Pack]:
+    check_length("ArchiveIndex", len(message.pack_bytes), limits.MAX_PACKS_OF_DISTRICT, "packs")
+    shas = _cut("packs", message.packs, 32, len(message.pack_bytes))
+    return [Pack(sha, size) for sha, size in zip(shas, message.pack_bytes, strict=True)]
+
+
+def _entries(
+    message: archive_index_pb2.ArchiveIndex, district: District, packs: Sequence[Pack]
+) -> Iterator[ArchiveEntry]:
+    count = len(message.places)
+    for name in ("versions", "packs_of", "starts", "sizes"):
+        if len(getattr(message, name)) != count:
+            raise BadValue(f"{len(getattr(message, name))} {name} of {count} tiles")
+    if any(place >= len(packs) for place in message.packs_of):
+        raise BadValue(f"a tile in pack {max(message.packs_of)} of {len(packs)}")
+    places = list(accumulate(message.places))
+    if places and places[-1] >= _TILES:
+        raise BadValue(f"a tile at place {places[-1]} of a district's {_TILES}")
+    columns = zip(
+        places,
+        message.versions,
+        _cut("hashes", message.hashes, ANSWER_HASH_BYTES, count),
+        _cut("signatures", message.signed, SIGNED_BYTES, count),
+        message.packs_of,
+        message.starts,
+        message.sizes,
+        strict=True,
+    )
+    for place, version, content, signed, pack, start, size in columns:
+        tile = TileId(district.first_morton + place)
+        yield ArchiveEntry(tile, version, content, signed, packs[pack], start, size)
+
+
+@dataclass(frozen=True, slots=True)
+class ArchiveRoot:
+    """The districts of an archive by layer, each ascending."""
+
+    districts: Mapping[str, tuple[District, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for layer in self.districts:
+            check_text("layer", layer, LAYER_PATTERN)
+        total = sum(map(len, self.districts.values()))
+        check_length("ArchiveRoot", total, limits.MAX_DISTRICTS_OF_ARCHIVE, "districts")
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.ArchiveRoot."""
+        layers = sorted(self.districts)
+        numbers = [[one.first_morton // _TILES for one in self.districts[layer]] for layer in layers]
+        message = archive_root_pb2.ArchiveRoot(
+            major=MAJOR,
+            layers=layers,
+            counts=[len(some) for some in numbers],
+            districts=[step for some in numbers for step in _steps(some)],
+        )
+        return serialise(message, limits.MAX_ARCHIVE_ROOT_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "ArchiveRoot":
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(archive_root_pb2.ArchiveRoot, data, limits.MAX_ARCHIVE_ROOT_BYTES)
+        check_major(message, "ArchiveRoot")
+        check_length("ArchiveRoot", len(message.districts), limits.MAX_DISTRICTS_OF_ARCHIVE, "districts")
+        layers, counts = list(message.layers), list(message.counts)
+        if layers != sorted(set(layers)) or len(counts) != len(layers) or sum(counts) != len(message.districts):
+            raise BadValue(
+                f"ArchiveRoot with {len(layers)} layers, {len(counts)} counts and {len(message.districts)} districts"
+            )
+        ends = list(accumulate(counts))
+        with refusing("ArchiveRoot"):
+            return cls(
+                {
+                    layer: tuple(map(_district, _sums(message.districts[end - count : end])))
+                    for layer, count, end in zip(layers, counts, ends, strict=True)
+                }
+            )
+
+
+def _district(number: int) -> District:
+    return TileId(number * _TILES).district
+
+
+def _sums(steps: Sequence[int]) -> list[int]:
+    if any(step == 0 for step in steps[1:]):
+        raise BadValue("a district twice")
+    return list(accumulate(steps))
+
+
+def _steps(numbers: Sequence[int]) -> list[int]:
+    return [*numbers[:1], *(after - before for before, after in pairwise(numbers))]
+
+
+def _cut(what: str, data: bytes, each: int, count: int) -> list[bytes]:
+    if len(data) != each * count:
+        raise BadValue(f"{len(data)} bytes of {what}, need {each} for each of {count}")
+    return [data[at : at + each] for at in range(0, len(data), each)]

@@ -1,0 +1,246 @@
+"""A mirror of an archive that forges, cuts off, rolls back and never ends: a clear error, and nothing is lost."""
+
+import resource
+from collections.abc import Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import archive_mirror as mirrors
+import pytest
+from archive_mirror import Answer, Mirror, mirror_of
+from signing_scene import Authority
+from versions_scene import FIRST, LAYER, content
+
+from gnd.deploy.archive_fetch import ArchiveFetcher, FetchedArchive
+from gnd.fleet_bus.publishers import Publishers
+from gnd.gnd_map.region import Region
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.archive import ArchiveEntry, ArchiveIndex, Pack, index_name, pack_name
+from gnd.tile_client import http_reader
+from gnd.tile_client.archive import Archive
+from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
+from gnd.tile_client.http_reader import PATIENT, Patience
+from gnd.tile_store.objects import FolderObjects
+from gnd.tile_store.publishing import publish
+from gnd.tile_store.signing import Signing
+from gnd.tile_store.sqlite_store import SqliteStore
+
+TILES = [TileId(FIRST.morton + n) for n in range(4)]
+INDEX = index_name(LAYER, FIRST.district)
+
+
+@dataclass
+class ArchiveScene:
+    """An archive with two versions of each tile, its hostile mirror, and a client that holds the newer ones."""
+
+    folder: Path
+    parts: dict[str, Path]
+    old: FolderObjects
+    new: FolderObjects
+    mirror: Mirror
+    client: SqliteStore
+    patience: Patience = PATIENT
+
+    def fetch(self, *, is_believing: bool = False) -> FetchedArchive:
+        with Archive(self.mirror.url, patience=self.patience) as archive:
+            publishers = None if is_believing else Publishers(self.parts["vehicle"], archive.fetch_certificate)
+            return ArchiveFetcher(archive, self.client, publishers).fetch((), Region(""))
+
+    def serve(self, objects: FolderObjects) -> None:
+        self.mirror.folder = Path(objects.location)
+
+    def index(self, objects: FolderObjects) -> ArchiveIndex:
+        data = objects.get(INDEX)
+        assert data is not None
+        return ArchiveIndex.decode(data)
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    authority = Authority(tmp_path_factory.mktemp("parts"))
+    found = {role: authority.part(role, f"{role}1") for role in ("operator", "vehicle", "tiles")}
+    foreign = Authority(tmp_path_factory.mktemp("foreign"))
+    return found | {"foreign": foreign.part("operator", "mallory")}
+
+
+@pytest.fixture
+def scene(tmp_path: Path, parts: dict[str, Path]) -> Iterator[ArchiveScene]:
+    old, new = FolderObjects(tmp_path / "old"), FolderObjects(tmp_path / "new")
+    with SqliteStore(tmp_path / "map.sqlite", signing=Signing(parts["operator"])) as store:
+        for objects, seed in ((old, 1), (new, 100)):
+            store.put_tiles([content(tile, seed + n) for n, tile in enumerate(TILES)])
+            publish(store, objects, [LAYER])
+    with SqliteStore(tmp_path / "client.sqlite") as client, mirror_of(tmp_path / "new") as mirror:
+        yield ArchiveScene(tmp_path, parts, old, new, mirror, client)
+
+
+def test_the_mirror_itself_is_good(scene: ArchiveScene) -> None:
+    done = scene.fetch()
+    assert (done.fetched, done.wrong) == (4, {})
+
+
+def test_an_older_state_takes_nothing_away(scene: ArchiveScene) -> None:
+    scene.fetch()
+    before = scene.client.heads()
+    scene.serve(scene.old)
+    done = scene.fetch()
+    assert len(done.wrong) == 4
+    assert all("version 1 is offered, version 2 is here" in why for why in done.wrong.values())
+    assert scene.client.heads() == before
+    assert scene.fetch(is_believing=True).wrong.keys() == done.wrong.keys()  # so far also without an authority
+
+
+def test_an_old_version_under_a_new_number_is_refused(scene: ArchiveScene) -> None:
+    """The index names version 3; what lies there is the old content, rightly signed as version 1."""
+    scene.fetch()
+    before = scene.client.heads()
+    index = scene.index(scene.old)
+    entries = tuple(ArchiveEntry(e.tile, 3, e.hash, e.signed, e.pack, e.start, e.size) for e in index.entries)
+    scene.old.put(INDEX, ArchiveIndex(LAYER, index.district, entries).encode())
+    scene.serve(scene.old)
+    assert all("another tile or version lies there" in why for why in scene.fetch().wrong.values())
+    assert scene.client.heads() == before
+
+
+def forged(scene: ArchiveScene, signer: str | None) -> FetchedArchive:
+    """An archive of another world, version 3, signed by somebody who may not, or by nobody."""
+    objects = FolderObjects(scene.folder / "forged")
+    signing = None if signer is None else Signing(scene.parts[signer])
+    with SqliteStore(scene.folder / "forged.sqlite", signing=signing) as store:
+        for seed in (1, 2, 3):
+            store.put_tiles([content(tile, 1000 + seed) for tile in TILES])
+        publish(store, objects, [LAYER])
+    scene.serve(objects)
+    return scene.fetch()
+
+
+@pytest.mark.parametrize(
+    ("signer", "why"), [("foreign", "not of our authority"), (None, "nobody has signed it")], ids=["foreign", "nobody"]
+)
+def test_another_world_is_refused(scene: ArchiveScene, signer: str | None, why: str) -> None:
+    scene.fetch()
+    before = scene.client.heads()
+    done = forged(scene, signer)
+    assert len(done.wrong) == 4
+    assert why in next(iter(done.wrong.values()))
+    assert scene.client.heads() == before
+
+
+def test_a_good_signature_over_other_content_is_refused(scene: ArchiveScene) -> None:
+    """The pack holds, under the signature of one tile, what lies in another one; the index is made to fit."""
+    index = scene.index(scene.new)
+    first, second = index.entries[:2]
+    entries = (
+        ArchiveEntry(first.tile, 2, second.hash, second.signed, second.pack, second.start, second.size),
+        *index.entries[1:],
+    )
+    scene.new.put(INDEX, ArchiveIndex(LAYER, index.district, entries).encode())
+    done = scene.fetch()
+    assert list(done.wrong) == [f"{LAYER} {first.tile.path}"]
+    assert "another tile or version lies there" in done.wrong[f"{LAYER} {first.tile.path}"]
+    assert done.fetched == 3
+
+
+def test_flipped_bits_are_found_also_without_an_authority(scene: ArchiveScene) -> None:
+    scene.mirror.wrong["pack/"] = mirrors.flipped
+    done = scene.fetch(is_believing=True)
+    assert done.fetched + len(done.wrong) == 4
+    assert len(done.wrong) >= 3
+    scene.mirror.wrong.clear()
+    assert scene.fetch(is_believing=True).wrong == {}
+    assert len(scene.client.heads()) == 4
+
+
+def test_an_index_of_another_district_is_refused(scene: ArchiveScene) -> None:
+    index = scene.index(scene.new)
+    elsewhere = TileId(FIRST.morton + 1024).district
+    moved = ArchiveIndex(LAYER, elsewhere, ()).encode()
+    scene.mirror.wrong["index/"] = mirrors.instead(moved)
+    with pytest.raises(ArchiveWrong, match="is that of"):
+        scene.fetch()
+    assert index.entries
+
+
+def test_a_pack_that_is_not_there_is_an_error(scene: ArchiveScene) -> None:
+    gone = Pack(sha256(b"gone").digest(), 1000)
+    index = scene.index(scene.new)
+    entries = tuple(ArchiveEntry(e.tile, 2, e.hash, e.signed, gone, 0, 500) for e in index.entries)
+    scene.new.put(INDEX, ArchiveIndex(LAYER, index.district, entries).encode())
+    with pytest.raises(ArchiveAway, match=f"{pack_name(gone.sha)}: not there, though an index names it"):
+        scene.fetch()
+
+
+@pytest.fixture
+def hurried(scene: ArchiveScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same rules with shorter times."""
+    scene.patience = Patience(2, 0.3)
+    monkeypatch.setattr(http_reader, "LEAST_RATE", 1e9)
+    monkeypatch.setattr(http_reader, "FIRST_PAUSE_S", 0.01)
+
+
+WAYS = {
+    "cut off": (mirrors.cut_off, ArchiveAway, "IncompleteRead|cut off"),
+    "told too long": (mirrors.told_too_long, ArchiveWrong, "at most .* can be right"),
+    "endless": (mirrors.endless, ArchiveWrong, "more than the .* bytes that can be right"),
+    "dripping": (mirrors.dripping, ArchiveAway, "not done within"),
+    "dripping head": (mirrors.dripping_head, ArchiveAway, "not done within"),
+    "endless head": (mirrors.endless_head, ArchiveAway, "more than 100 headers"),
+    "encoded": (mirrors.encoded, ArchiveWrong, "comes encoded"),
+    "moved": (mirrors.moved, ArchiveWrong, r"moved \(302\); nothing is followed"),
+    "broken": (mirrors.broken, ArchiveAway, "the server says 503"),
+    "nonsense": (mirrors.nonsense, ArchiveAway, "BadStatusLine|SSH-2.0"),
+}
+
+
+@pytest.mark.parametrize("where", ["archive.gnd", "index/", "pack/"])
+@pytest.mark.parametrize("way", WAYS)
+def test_wrong_answers_are_clear_errors_within_bounds(scene: ArchiveScene, hurried: None, way: str, where: str) -> None:
+    answer, kind, why = WAYS[way]
+    scene.mirror.wrong[where] = answer
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(kind, match=why) as caught:
+        scene.fetch()
+    assert f"{scene.mirror.url}/{where}" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    assert scene.client.heads() == []
+    scene.mirror.wrong.clear()
+    assert scene.fetch().fetched == 4  # and it works again as soon as the mirror does
+
+
+@pytest.mark.parametrize("answer", [mirrors.shorter, mirrors.a_page], ids=["shorter", "a page"])
+@pytest.mark.parametrize("where", ["archive.gnd", "index/", "pack/"])
+def test_other_bytes_are_clear_errors(scene: ArchiveScene, hurried: None, answer: Answer, where: str) -> None:
+    scene.mirror.wrong[where] = answer
+    with pytest.raises(ArchiveError):
+        scene.fetch()
+    assert scene.client.heads() == []
+
+
+def test_another_range_than_asked_for_is_refused(scene: ArchiveScene, hurried: None) -> None:
+    scene.mirror.wrong["pack/"] = mirrors.other_range
+    with pytest.raises(ArchiveWrong, match=r"asked for bytes 0-\d+/\d+, got 'bytes 0-9/"):
+        scene.fetch()
+
+
+def test_a_server_without_ranges_will_do(scene: ArchiveScene) -> None:
+    scene.mirror.wrong["pack/"] = lambda handler, data: handler.whole(data)
+    assert scene.fetch().fetched == 4
+
+
+def test_what_came_before_it_failed_is_kept(scene: ArchiveScene, hurried: None) -> None:
+    """The second pack never comes; the first one is in the store."""
+    with SqliteStore(scene.folder / "map.sqlite", signing=Signing(scene.parts["operator"])) as store:
+        store.put_tiles([content(TILES[0], 500)])
+        publish(store, scene.new, [LAYER])
+    packs = sorted(scene.index(scene.new).packs, key=lambda pack: pack.sha)
+    assert len(packs) == 2
+    scene.mirror.wrong[pack_name(packs[1].sha)] = mirrors.broken
+    with pytest.raises(ArchiveAway):
+        scene.fetch()
+    kept = len(scene.client.heads())
+    assert 0 < kept < 4
+    scene.mirror.wrong.clear()
+    done = scene.fetch()
+    assert (done.unchanged, done.fetched) == (kept, 4 - kept)

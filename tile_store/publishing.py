@@ -1,0 +1,324 @@
+"""A store's released versions as a static archive in a folder or a bucket (`gnd.schemas.archive` says of what).
+
+Packs are written before the index that names them, and an index is replaced as a whole: whoever reads sees a district
+as it was before or as it is now. Whoever is interrupted publishes again; districts that are done stay done. Nothing is
+removed but by `prune`.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from hashlib import sha256
+from itertools import groupby
+from typing import Final
+
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.archive import (
+    CERTIFICATE_FOLDER,
+    INDEX_FOLDER,
+    PACK_FOLDER,
+    ROOT_NAME,
+    SIGNED_BYTES,
+    UNSIGNED,
+    ArchiveEntry,
+    ArchiveIndex,
+    ArchiveRoot,
+    Pack,
+    certificate_name,
+    index_name,
+    pack_name,
+    place_of_index,
+)
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.limits import MAX_PACK_BYTES
+from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
+from gnd.schemas.tiles import CatalogEntry, TileReply
+from gnd.tile_store.connection import fetch
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.objects import FolderObjects, NamedObjects
+from gnd.tile_store.regions import morton_range
+from gnd.tile_store.released import released_heads
+from gnd.tile_store.sqlite_store import SqlStore
+from gnd.tile_store.values import NS_PER_S, StoredTile
+
+MOST_PACKS: Final = 8
+"""A district in more packs is packed anew: a client asks once for each."""
+LEAST_LIVE: Final = 0.5
+"""So is one of whose packs less than this share is still named."""
+PRUNED_AFTER_S: Final = 3600.0
+"""What nothing names stays for so long: a publisher may be about to name it, a reader hold an index that does."""
+_DISTRICT_DIGITS: Final = 15
+_LOG = logging.getLogger(__name__)
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(slots=True)
+class Published:
+    """What publishing has done.
+
+    Attributes:
+        districts: looked at, ...
+        switched: ... of which so many have a new index, ...
+        repacked: ... so many of them because their tiles lay in too many packs, or among too much that is outdated.
+        tiles: published in these districts, ...
+        written: ... of which so many were written now.
+        objects, bytes: written, all together.
+        unsigned: published tiles that nobody has signed.
+        set_back: tiles whose published version had a higher number.
+        damaged: tiles that cannot be read, and why; what was published of them stays.
+    """
+
+    districts: int = 0
+    switched: int = 0
+    repacked: int = 0
+    tiles: int = 0
+    written: int = 0
+    objects: int = 0
+    bytes: int = 0
+    unsigned: int = 0
+    set_back: int = 0
+    damaged: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Pruned:
+    """What `prune` has removed, and how many packs are still named."""
+
+    objects: int
+    bytes: int
+    named: int
+
+
+def check_whole_districts(region: str) -> str:
+    """The region itself; StoreError where it is smaller than a district, which has one index."""
+    morton_range(region)
+    if len(region.replace("/", "")) > _DISTRICT_DIGITS:
+        raise StoreError(f"region {region!r} is smaller than a district; its first three chunks name the whole one")
+    return region
+
+
+def publish(
+    store: SqlStore,
+    objects: NamedObjects,
+    layers: Sequence[str],
+    regions: Sequence[str] = ("",),
+    progress: Progress = lambda _step, _done, _total: None,
+) -> Published:
+    """Bring an archive to the store's released versions.
+
+    Args:
+        store: it is only read.
+        objects: where the archive is, or will be.
+        layers: which layers.
+        regions: leading parts of tile paths, whole districts.
+        progress: is told the layer, districts done, and how many there are.
+
+    Raises:
+        StoreError: a region that cuts through districts; the store or the objects fail; somebody else publishes there.
+    """
+    done, writing = Published(), _Writing(store, objects)
+    with _alone(objects):
+        for layer in layers:
+            heads = {
+                head.tile: head
+                for region in map(check_whole_districts, regions)
+                for head in released_heads(store, layer, region)
+            }
+            districts = groupby(sorted(heads.values(), key=lambda head: head.tile), key=lambda head: head.tile.district)
+            listed = [(district, list(some)) for district, some in districts]
+            for place, (district, some) in enumerate(listed, 1):
+                writing.district(layer, district, some, done)
+                progress(layer, place, len(listed))
+        _write_root(objects, done)
+    return done
+
+
+def prune(objects: NamedObjects, older_than_s: float = PRUNED_AFTER_S) -> Pruned:
+    """Remove packs that no index names and that were written so long ago. What an index names stays, whoever wrote it.
+
+    Raises:
+        StoreError: an index cannot be read, so that nobody knows what it names; nothing is removed then.
+    """
+    before_ns = time.time_ns() - round(older_than_s * NS_PER_S)
+    with _alone(objects):
+        listed = {one.name for one in objects.each(PACK_FOLDER)}  # before the indexes are read: later ones stay
+        named = {pack_name(pack.sha) for index in _indexes(objects) for pack in index.packs}
+        # and after: one that a publisher has written again meanwhile is young now
+        old = [one for one in objects.each(PACK_FOLDER) if one.name in listed - named and one.written_ns < before_ns]
+        objects.remove(one.name for one in old)
+        if isinstance(objects, FolderObjects):
+            objects.remove_partial(before_ns)
+    return Pruned(len(old), sum(one.size_bytes for one in old), len(named))
+
+
+class _Writing:
+    """Writes districts of one store to one archive."""
+
+    def __init__(self, store: SqlStore, objects: NamedObjects) -> None:
+        self._store, self._objects = store, objects
+        self._certificates = {one.name for one in objects.each(CERTIFICATE_FOLDER)}
+
+    def district(self, layer: str, district: District, heads: Sequence[CatalogEntry], done: Published) -> None:
+        """Write what is new of a district, then its index, where anything is."""
+        name = index_name(layer, district)
+        before = self._published(name)
+        signed = self._signed(layer, district)
+        held = {} if before is None else dict(before.by_tile)
+        kept = {head.tile: held[head.tile] for head in heads if _is_same(held.get(head.tile), head, signed)}
+        done.districts += 1
+        done.tiles += len(heads)
+        done.set_back += sum(head.tile in held and held[head.tile].version > head.version for head in heads)
+        if before is None or len(kept) < len(heads) or len(held) > len(heads):
+            entries = self._entries(layer, heads, kept, held, done)
+            index = ArchiveIndex(layer, district, tuple(sorted(entries, key=lambda entry: entry.tile)))
+            if index != before:
+                self._put(name, index.encode(), done, changes=True)
+                done.switched += 1
+            kept = dict(index.by_tile)
+        done.unsigned += sum(entry.signed == UNSIGNED for entry in kept.values())
+
+    def _published(self, name: str) -> ArchiveIndex | None:
+        data = self._objects.get(name)
+        try:
+            return None if data is None else ArchiveIndex.decode(data)
+        except SchemaError as error:
+            _LOG.warning("%s: %s is none and is written anew: %s", self._objects.location, name, error)
+            return None
+
+    def _signed(self, layer: str, district: District) -> dict[TileId, bytes]:
+        """Of the newest versions of a district the first bytes of their signatures; no body is read."""
+        first, end = morton_range(district.path)
+        rows = self._store.look(lambda c: fetch(c, "signed_heads", {"layer": layer, "first": first, "end": end}))
+        released = {TileId(tile): bytes(signature or UNSIGNED)[:SIGNED_BYTES] for tile, signature in rows}
+        for tile, trial in self._store.trials(layer, district.path).items():
+            base = self._store.get(layer, tile, trial.base_version)
+            released[tile] = UNSIGNED if base is None else _signed_of(base)
+        return released
+
+    def _entries(
+        self,
+        layer: str,
+        heads: Sequence[CatalogEntry],
+        kept: dict[TileId, ArchiveEntry],
+        held: dict[TileId, ArchiveEntry],
+        done: Published,
+    ) -> list[ArchiveEntry]:
+        """What the index will say; what it names is written."""
+        if _is_scattered(list(kept.values())):
+            kept = {}
+            done.repacked += 1
+        entries, records = list(kept.values()), list[tuple[StoredTile, bytes]]()
+        for head in heads:
+            if head.tile in kept:
+                continue
+            try:
+                stored = self._readable(layer, head)
+            except GndError as error:
+                done.damaged[f"{layer} {head.tile.path}"] = str(error)
+                entries += [held[head.tile]] if head.tile in held else []
+                continue
+            records.append((stored, _record(stored)))
+        done.written += len(records)
+        for some in _packs(records):
+            entries += self._pack(some, done)
+        return entries
+
+    def _readable(self, layer: str, head: CatalogEntry) -> StoredTile:
+        stored = self._store.get(layer, head.tile, head.version)
+        if stored is None:
+            raise StoreError(f"version {head.version} is gone")
+        stored.decode()  # no client could use it else
+        self._show_certificate(stored)
+        return stored
+
+    def _pack(self, records: Sequence[tuple[StoredTile, bytes]], done: Published) -> Iterator[ArchiveEntry]:
+        data = b"".join(record for _, record in records)
+        pack, start = Pack(sha256(data).digest(), len(data)), 0
+        # written also where it is there: it is young then, and nobody prunes it before the index names it
+        self._put(pack_name(pack.sha), data, done)
+        for stored, record in records:
+            content = stored.sha[:ANSWER_HASH_BYTES]
+            yield ArchiveEntry(stored.tile, stored.version, content, _signed_of(stored), pack, start, len(record))
+            start += len(record)
+
+    def _show_certificate(self, stored: StoredTile) -> None:
+        if stored.signature is None:
+            return
+        name = certificate_name(stored.signature.signer)
+        if name in self._certificates:
+            return
+        chain = self._store.publisher_chain(stored.signature.signer)
+        if chain is not None:
+            self._objects.put(name, chain)
+            self._certificates.add(name)
+
+    def _put(self, name: str, data: bytes, done: Published, *, changes: bool = False) -> None:
+        self._objects.put(name, data, changes=changes)
+        done.objects += 1
+        done.bytes += len(data)
+
+
+def _alone(objects: NamedObjects) -> AbstractContextManager[None]:
+    """One publisher at a time, where that can be told; of two, each index is as the later one wrote it."""
+    return objects.locked() if isinstance(objects, FolderObjects) else nullcontext()
+
+
+def _is_same(entry: ArchiveEntry | None, head: CatalogEntry, signed: dict[TileId, bytes]) -> bool:
+    if entry is None:
+        return False
+    told = entry.version, entry.hash, entry.signed
+    return told == (head.version, head.sha[:ANSWER_HASH_BYTES], signed.get(head.tile, UNSIGNED))
+
+
+def _is_scattered(kept: Sequence[ArchiveEntry]) -> bool:
+    """Whether what stays lies in so many packs, or in packs so empty, that it is packed anew with what comes."""
+    packs = {entry.pack for entry in kept}
+    live = sum(entry.size for entry in kept)
+    return len(packs) >= MOST_PACKS or live < LEAST_LIVE * sum(pack.size_bytes for pack in packs)
+
+
+def _signed_of(stored: StoredTile) -> bytes:
+    return UNSIGNED if stored.signature is None else stored.signature.signature[:SIGNED_BYTES]
+
+
+def _record(stored: StoredTile) -> bytes:
+    """A tile as it lies in a pack."""
+    return TileReply("blob", stored.to_blob(), signature=stored.signature).encode()
+
+
+def _packs(records: Sequence[tuple[StoredTile, bytes]]) -> Iterator[list[tuple[StoredTile, bytes]]]:
+    """In groups that a pack holds."""
+    group, size = list[tuple[StoredTile, bytes]](), 0
+    for one in records:
+        if group and size + len(one[1]) > MAX_PACK_BYTES:
+            yield group
+            group, size = [], 0
+        group.append(one)
+        size += len(one[1])
+    if group:
+        yield group
+
+
+def _indexes(objects: NamedObjects) -> Iterator[ArchiveIndex]:
+    for one in objects.each(INDEX_FOLDER):
+        data = objects.get(one.name)
+        try:
+            if data is None:
+                raise StoreError(f"{objects.location}: {one.name} has gone meanwhile")
+            yield ArchiveIndex.decode(data)
+        except SchemaError as error:
+            raise StoreError(f"{objects.location}: {one.name} is no index, so nothing is removed: {error}") from error
+
+
+def _write_root(objects: NamedObjects, done: Published) -> None:
+    """Name the districts that have an index, where that has changed."""
+    places = sorted(place_of_index(one.name) for one in objects.each(INDEX_FOLDER))
+    layers = {layer: tuple(district for _, district in some) for layer, some in groupby(places, key=lambda one: one[0])}
+    root = ArchiveRoot(layers).encode()
+    if objects.get(ROOT_NAME) != root:
+        objects.put(ROOT_NAME, root, changes=True)
+        done.objects += 1
+        done.bytes += len(root)

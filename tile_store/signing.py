@@ -1,0 +1,129 @@
+"""Signatures of versions in a store: made when a version is published, kept beside it, checked before it is built upon.
+
+A store in which somebody has signed stays one of signed versions: who has no identity publishes nothing there.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from gnd.fleet_bus.errors import IdentityError, NotAnsweredFor, SealError
+from gnd.fleet_bus.identity.names import identity_of_environment
+from gnd.fleet_bus.publishers import PublisherKey, Publishers
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.version_signature import VersionSignature, VersionStatement
+from gnd.tile_store.connection import SqlConnection, change, fetch, post
+from gnd.tile_store.errors import NotPublished, StoreDamaged
+from gnd.tile_store.values import NS_PER_S, StoredTile
+
+NOT_SIGNED: Final = {"signer": None, "signed_s": None, "signature": None}
+
+
+class Signing:
+    """Signs what this process publishes, and checks what it builds upon. Safe in several threads.
+
+    Args:
+        folder: identity folder of a shard or an operator.
+
+    Raises:
+        IdentityError: the folder cannot be read, or its role signs no versions.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._key, self.publishers = PublisherKey(folder), Publishers(folder)
+
+    @classmethod
+    def of_environment(cls) -> "Signing | None":
+        """With the identity of this process (`--identity`, GND_IDENTITY); None: it has none."""
+        folder = identity_of_environment()
+        return None if folder is None else cls(folder)
+
+    def sign(self, statement: VersionStatement) -> tuple[VersionSignature, bytes]:
+        """The signature under a statement, and the certificates behind it.
+
+        Raises:
+            NotPublished: the certificate of this process has ended.
+        """
+        # clocks step: nothing is signed before it was made
+        signed_s = max(time.time_ns() // NS_PER_S, statement.made_s)
+        try:
+            signer, signature, chain = self._key.sign(lambda signer: statement.text(signer, signed_s), signed_s)
+        except IdentityError as error:
+            raise NotPublished(f"nothing can be signed, and so nothing published: {error}") from error
+        return VersionSignature(signer, statement.kind, statement.made_s, signed_s, signature), chain
+
+
+def columns(c: SqlConnection, signing: Signing | None, row: Mapping[str, Any], day: int) -> dict[str, Any]:
+    """The columns of a version's signature.
+
+    Args:
+        c: in the version's transaction.
+        signing: of this process.
+        row: the version's other columns.
+        day: when the world looked so.
+
+    Raises:
+        NotPublished: the store's versions are signed, and this process has no identity, or one that has ended.
+    """
+    if signing is None:
+        if fetch(c, "any_publisher"):
+            raise NotPublished(
+                f"tile {TileId(row['tile']).path} of layer {row['layer']}: the versions of this store are signed;"
+                " publish with the identity of a shard or an operator (--identity FOLDER)"
+            )
+        return dict(NOT_SIGNED)
+    made_s = row["created_ns"] // NS_PER_S
+    signature, chain = signing.sign(
+        VersionStatement(row["layer"], TileId(row["tile"]), row["version"], row["sha"], row["kind"], day, made_s)
+    )
+    post(c, "put_publisher", {"signer": signature.signer, "chain": chain, "since_s": signature.signed_s})
+    return {"signer": signature.signer, "signed_s": signature.signed_s, "signature": signature.signature}
+
+
+def sign_again(c: SqlConnection, signing: Signing | None, stored: StoredTile) -> None:
+    """Put another signature under a version: of who runs this process, with the time of now."""
+    row = {"layer": stored.layer, "tile": stored.tile.morton, "version": stored.version}
+    row |= {"sha": stored.sha, "kind": stored.kind, "created_ns": stored.created_ns}
+    change(c, "set_signature", row | columns(c, signing, row, stored.day))
+
+
+def check_signed(c: SqlConnection, signing: Signing | None, stored: StoredTile | None) -> None:
+    """Whether a version is what one of our publishers has signed; a process without an identity takes what is there.
+
+    Raises:
+        StoreDamaged: it is not; nothing is to be made of it.
+    """
+    if signing is None or stored is None:
+        return
+    try:
+        who_signed(c, signing.publishers, stored)
+    except SealError as error:
+        raise StoreDamaged(
+            f"tile {stored.tile.path} of layer {stored.layer} version {stored.version}: {error};"
+            " see `gnd map verify --signatures`"
+        ) from error
+
+
+def who_signed(c: SqlConnection, publishers: Publishers, stored: StoredTile) -> str:
+    """Role and name of the publisher that answers for a version.
+
+    Raises:
+        SealError: nobody does who may; why.
+    """
+    signed = stored.signature
+    if signed is None:
+        raise NotAnsweredFor("unsigned", "not signed (`gnd map sign`)")
+    if not publishers.knows(signed.signer):
+        rows = fetch(c, "chain_of_publisher", {"signer": signed.signer})
+        if not rows:
+            raise NotAnsweredFor("unknown", f"the store has no certificate {signed.signer.hex()}")
+        publishers.learn(rows[0][0])
+    text = stored.statement.text(signed.signer, signed.signed_s)
+    return str(publishers.check(signed.signer, signed.signed_s, text, signed.signature))
+
+
+def chain_of(c: SqlConnection, signer: bytes) -> bytes | None:
+    """The certificates of somebody who has signed versions of the store; None: nobody of that id has."""
+    rows = fetch(c, "chain_of_publisher", {"signer": signer})
+    return bytes(rows[0][0]) if rows else None
