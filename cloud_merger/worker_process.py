@@ -5,6 +5,8 @@ something has come, and its end when that process has ended, however it did. Its
 to tell how far his report has come. The process that receives tells it, for it has agreed on keys with the vehicles.
 """
 
+from gnd.ending import run_program  # isort: skip  # registers its end before others do
+
 import contextlib
 import io
 import logging
@@ -158,4 +160,4 @@ def _exactly(count: int) -> bytes:
 
 
 if __name__ == "__main__":
-    main()
+    run_program(main)

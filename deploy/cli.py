@@ -1,5 +1,7 @@
 """The command `gnd`: one table of subcommands, each loaded when it is called."""
 
+from gnd.ending import run_program  # isort: skip  # registers its end before others do
+
 import importlib
 import os
 import sys
@@ -112,5 +114,10 @@ def main() -> None:
         sys.exit(0)
 
 
+def program() -> None:
+    """The command `gnd` as a process of its own."""
+    run_program(main)
+
+
 if __name__ == "__main__":
-    main()
+    program()

@@ -178,6 +178,7 @@ class _Asking:
             RequestFailed, RequestRefused, BusClosed.
         """
         deadline_s, with_chain, short = time.monotonic() + timeout_s, False, True
+        cause = ""
         for attempt in itertools.count(1):
             left_s = max(deadline_s - time.monotonic(), 0.001)
             answers = self._once(
@@ -185,6 +186,8 @@ class _Asking:
             )
             if good(answers):
                 return answers
+            if answers.errors or answers.ok:  # a last attempt cut short by the deadline often brings back nothing
+                cause = answers.cause()
             was_short, short = short, short and bool(answers.retry_after_s)
             if answers.signature_wanted and was_short:
                 continue
@@ -195,7 +198,7 @@ class _Asking:
                 raise RequestRefused(self.key, attempt, f"refused: {answers.refusal}")
             wait_s = max(retry.wait_s(attempt), answers.retry_after_s * random.uniform(1.0, BUSY_SPREAD))
             if time.monotonic() + wait_s >= deadline_s:
-                cause = f"{answers.cause()} (gave up after {timeout_s:g} s)"
+                cause = f"{cause or answers.cause()} (gave up after {timeout_s:g} s)"
                 raise RequestFailed(self.key, attempt, cause, answers.retry_after_s)
             if self.connection.closed.wait(wait_s):
                 raise BusClosed(f"the bus was closed while asking {self.key} for the {attempt + 1}th time")

@@ -89,10 +89,9 @@ class Cloud:
         """Start shards and wait until they show that they live."""
         for name in names:
             options = ["--id", name, "--store", str(self.path), "--connect", self.endpoint]
-            command = "from gnd.cloud_merger.cli import merger; merger()"
             with (self._log / f"{name}.log").open("ab") as log:
                 self.shards[name] = subprocess.Popen(
-                    [sys.executable, "-c", command, *options, "--config", str(self.config_path)],
+                    [sys.executable, "-m", "gnd.deploy.cli", "merger", *options, "--config", str(self.config_path)],
                     stdout=log,
                     stderr=log,
                     env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
