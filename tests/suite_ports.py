@@ -1,5 +1,6 @@
 """TCP ports for tests that run side by side."""
 
+import atexit
 import errno
 import os
 import random
@@ -45,6 +46,7 @@ def is_ours(start: int) -> bool:
         name.close()
         return False
     _HELD.append(name)
+    atexit.register(name.close)
     return True
 
 
