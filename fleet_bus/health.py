@@ -1,6 +1,7 @@
-"""The pages by which a process is watched: /metrics for Prometheus, /healthz for whoever restarts what is ill.
+"""The pages by which a process is watched: /metrics for Prometheus, /healthz for who asks whether it can do its work.
 
-Both answer from threads of their own; a check that hangs makes the process ill, not the page.
+/livez answers as long as the process does, whatever it depends on: a restart mends no database that is away. All answer
+from threads of their own; a check that hangs makes the process ill, not the page.
 """
 
 import errno
@@ -29,7 +30,7 @@ Check = Callable[[], str | None]
 
 
 class HealthServer:
-    """Serves both pages until closed.
+    """Serves the pages until closed.
 
     Args:
         port: where; 0 takes a free one.
@@ -76,12 +77,14 @@ class HealthServer:
         """Status, content type and body of one page."""
         if path == "/metrics":
             return 200, CONTENT_TYPE_LATEST, generate_latest(self._registry)
+        if path == "/livez":
+            return 200, "text/plain; charset=utf-8", b"ok\n"
         if path == "/healthz":
             found = {name: check.answer() for name, check in self._checks.items()}
             ill = {name: why for name, why in found.items() if why is not None}
             told = {"healthy": not ill, "checks": {name: why or "ok" for name, why in found.items()}}
             return (503 if ill else 200), "application/json", json.dumps(told, indent=1).encode() + b"\n"
-        return 404, "text/plain; charset=utf-8", b"there are /metrics and /healthz\n"
+        return 404, "text/plain; charset=utf-8", b"there are /metrics, /healthz and /livez\n"
 
 
 class _Watched:

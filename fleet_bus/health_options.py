@@ -14,6 +14,6 @@ def metrics_options(command: _F) -> _F:
         "--metrics-host", default="127.0.0.1", show_default=True, help="Address for them; 0.0.0.0 is every one."
     )
     port = click.option(
-        "--metrics-port", type=click.IntRange(0, 65_535), help="Serve /metrics and /healthz here.  [default: no]"
+        "--metrics-port", type=click.IntRange(0, 65_535), help="Serve /metrics, /healthz, /livez here.  [default: no]"
     )
     return port(host(command))

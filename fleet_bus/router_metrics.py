@@ -23,8 +23,9 @@ class _Router(Collector):
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         sessions = GaugeMetricFamily("gnd_router_sessions", "Sessions connected to this router.", labels=["kind"])
-        for kind, n in sorted((Counter({"client": 0}) | Counter(self._router.neighbours())).items()):
-            sessions.add_metric([kind], n)
+        found = Counter(self._router.neighbours())
+        for kind in sorted({"client", "router", *found}):  # also those of which there are none: alerts compare them
+            sessions.add_metric([kind], found[kind])
         yield sessions
 
 

@@ -32,6 +32,7 @@ def test_router_store_and_shard_show_how_they_are(parts: Parts) -> None:
         until(f"{name} is well", lambda name=name: parts.is_healthy(name))
     sessions = "gnd_router_sessions", "client"  # of the store, the shard and its worker
     until("all are connected", lambda: metrics(parts.ports["router"])[sessions] == 3)
+    assert metrics(parts.ports["router"])["gnd_router_sessions", "router"] == 0, "also what there is none of is shown"
     of_store = metrics(parts.ports["store"])
     assert of_store[("gnd_tiles",)] == 1
     assert of_store["gnd_shard_alive", "shard-0"] == 1
@@ -53,6 +54,7 @@ def test_router_store_and_shard_show_how_they_are(parts: Parts) -> None:
     other.execute("BEGIN IMMEDIATE")
     until("the store is ill", lambda: "no answer within" in parts.told("store")["store"])
     assert get(parts.ports["store"], "metrics")[0] == 200
+    assert get(parts.ports["store"], "livez") == (200, "ok\n"), "a restart would mend nothing"
     other.execute("ROLLBACK")
     other.close()
     until("the store is well", lambda: parts.is_healthy("store"))
