@@ -72,7 +72,7 @@ $(TOOLS)/.ready:
 	@touch $@
 
 LOCK = $(TOOLS)/bin/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
-  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --extra vehicle --extra cloud --extra sim --build-deps-for wheel -c constraints.txt
+  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --extra vehicle --extra cloud --extra sim --extra postgres --extra objects --build-deps-for wheel -c constraints.txt
 
 lock: $(TOOLS)/.ready  ## pin what the image installs, by version and hash: deploy/requirements.lock
 	$(LOCK) -o deploy/requirements.lock pyproject.toml
