@@ -2,6 +2,7 @@
 
 import ctypes.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -96,12 +97,40 @@ def test_what_the_units_forbid_fails(folder: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@needs_root
+needs_analyze = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+
+
+@needs_analyze
+@pytest.mark.parametrize("is_in_database", [False, True], ids=["file", "postgresql"])
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
-def test_systemd_calls_the_exposure_of_a_unit_ok(unit: Path) -> None:
-    words = ["systemd-analyze", "security", "--offline=true", "--threshold=20", str(unit)]
+def test_systemd_calls_the_exposure_of_a_unit_ok(unit: Path, is_in_database: bool, tmp_path: Path) -> None:
+    shutil.copy2(unit, tmp_path)
+    if is_in_database:
+        drop_in = tmp_path / f"{unit.name}.d" / "postgresql.conf"
+        drop_in.parent.mkdir()
+        shutil.copy2(DEPLOY / "systemd" / "postgresql.conf", drop_in)
+    words = ["systemd-analyze", "security", "--offline=true", "--threshold=17", str(tmp_path / unit.name)]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr
+
+
+@needs_analyze
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_systemd_knows_every_line_of_a_unit(unit: Path, tmp_path: Path) -> None:
+    """`verify` also wants the program, which is put there."""
+    (tmp_path / unit.name).write_text(unit.read_text().replace("/opt/gnd/.venv/bin/gnd", "/bin/true"))
+    done = subprocess.run(["systemd-analyze", "verify", str(tmp_path / unit.name)], capture_output=True, text=True)
+    assert unit.name.replace("@", "@i") not in done.stderr, done.stderr
+    assert unit.name not in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_a_unit_sees_its_own_identity_alone_and_may_write_there(unit: Path) -> None:
+    text = unit.read_text()
+    (identity,) = re.findall(r"--identity (\S+)", text)
+    assert identity.startswith("/etc/gnd/")
+    assert "\nTemporaryFileSystem=/etc/gnd:ro,mode=0755\n" in text
+    assert re.findall(r"^BindPaths=(.*)$", text, re.M) == [identity]
 
 
 @needs_root
