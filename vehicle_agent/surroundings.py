@@ -14,6 +14,7 @@ from gnd.gnd_map.errors import TileError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.schemas.limits import MAX_TILES_OF_DISTRICT
 from gnd.tile_client.exchange import Fetched
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
 from gnd.vehicle_agent.link.download import TileFetcher
@@ -26,7 +27,7 @@ AHEAD_S = 15.0  # tiles are asked for so long in advance, and at least `ahead_m`
 HELD_AHEAD_M: Final = 400.0
 """Where the cache holds this share of what is farther ahead, whether that still holds is asked with the next question:
 one of its own costs 400 B with its answer, another tile in it some 1."""
-HELD_AROUND_M: Final = 1000.0
+HELD_AROUND_M: Final = 1300.0
 """And so are those that the cache holds of the districts of the plan: they do not change with every degree of the
 heading, as what lies straight ahead does."""
 MOST_AROUND: Final = 256
@@ -59,6 +60,8 @@ class Surroundings:
         self._looked_at: F64 | None = None
         self._here: F64 | None = None
         self._asked: set[TileId] = set()  # with the last question, and not let go since
+        self._besides: tuple[TileId, ...] = ()  # named with it
+        self._passed: set[TileId] = set()  # let go: asked for again when they are wanted, not before
         self._beyond: tuple[TileId, ...] = ()  # farther ahead than the plan
         self._looked_beyond: F64 | None = None
         self._plan: list[Need] = []
@@ -150,8 +153,9 @@ class Surroundings:
         lead_s = LEAD_S + self._download_s(plan)
         if any(need.from_s <= lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
             self._asked = {need.tile_id for need in plan} | self._known_beyond() | self._still_around()
+            self._besides = self._of_known_districts()
         first = [need.tile_id for need in plan if need.tile_id in self._asked]
-        self._fetcher.want([*first, *sorted(self._asked.difference(first))])
+        self._fetcher.want([*first, *sorted(self._asked.difference(first))], self._besides)
 
     def _known_beyond(self) -> set[TileId]:
         """The tiles beyond the plan, where the cache holds many of them; then the others are most likely on no map,
@@ -160,6 +164,17 @@ class Surroundings:
         beyond = set(self._beyond).difference(self.wanted)
         held = sum(map(self._fetcher.is_held, beyond))
         return beyond | self._held_around() if held >= KNOWN_SHARE * len(beyond) else set()
+
+    def _of_known_districts(self) -> tuple[TileId, ...]:
+        """All tiles of the plan's districts, where the cache holds much of the plan: most are on no map, and to hear so
+        of a whole district costs some 20 B more than of the tiles ahead, which change with the heading.
+        """
+        if sum(map(self._fetcher.is_held, self.wanted)) < KNOWN_SHARE * len(self.wanted):
+            return ()
+        districts = sorted({tile.district for tile in self.wanted})
+        every = (TileId(one.first_morton + index) for one in districts for index in range(MAX_TILES_OF_DISTRICT))
+        known = self._asked.union(self._passed, self._fetcher.held_of(districts))
+        return tuple(tile for tile in every if tile not in known)
 
     def _still_around(self) -> set[TileId]:
         """Those of the tiles asked for before that are not far away: who forgets them asks again."""
@@ -171,7 +186,8 @@ class Surroundings:
 
     def _held_around(self) -> set[TileId]:
         """The nearest tiles that the cache holds of the plan's districts."""
-        held = self._fetcher.held_of({tile.district for tile in self.wanted})
+        districts = {tile.district for tile in self.wanted}
+        held = [tile for tile in self._fetcher.held_of(districts) if tile not in self._passed]
         if not held or self._here is None:
             return set()
         away_m = TileRectangles.of(self._map.grid_frame.frame, held).distances_m(self._here)
@@ -192,7 +208,8 @@ class Surroundings:
     def _let_go(self, here: F64) -> None:
         """Drop tiles far behind that nothing is counted about, and answers about tiles that are no longer wanted."""
         frame, limit_m = self._map.grid_frame.frame, self._parameters.forget_m
-        gone = [t for t in self._arrived if t not in self.wanted and t not in self._asked]
+        kept = self._asked.union(self.wanted, self._besides)
+        gone = [t for t in self._arrived if t not in kept]
         for tile_id in gone:
             del self._arrived[tile_id]
         for tile_id in left_behind(frame, self._map.tiles, here, limit_m):
@@ -203,6 +220,8 @@ class Surroundings:
         for tile_id in gone:
             self._fetcher.forget(tile_id)
         self._asked.difference_update(gone)
+        districts = {tile.district for tile in self.wanted}
+        self._passed = {tile for tile in self._passed.union(gone) if tile.district in districts}
 
     def _arrive(self, fetched: Fetched[Tile]) -> None:
         """Take an answer: a tile (or the knowledge that there is none) waits until it is near."""

@@ -197,3 +197,29 @@ def test_as_many_questions_are_on_their_way_as_the_link_carries(
         bus.close()
         opened.close()
     assert len(asked) >= len(set(asked)) == 3
+
+
+def test_of_tiles_named_besides_it_is_heard_which_are_on_no_map(
+    fetcher: TileFetcher, cache: TileCache, cloud: Bus, store: SqliteStore, tiles: dict[TileId, Tile]
+) -> None:
+    """What is on a map is not brought for that (but for one body, which an answer always has room for)."""
+    held, *others = sorted(tiles)
+    head = store.get("ndt", held)
+    assert head is not None
+    cache.put(head.decode())
+    in_district = [tile_id for tile_id in others if tile_id.district == held.district]
+    assert len(in_district) >= 2
+    every = (TileId(held.district.first_morton + index) for index in range(1024))
+    nowhere = next(tile_id for tile_id in every if store.get("ndt", tile_id) is None)
+    with TileServer(store, cloud):
+        fetcher.want([], besides=[*in_district, nowhere])
+        assert fetcher.wait_for([nowhere], 0.5, NEVER) == {nowhere}, "they are no reason to ask"
+        fetcher.want([held], besides=[*in_district, nowhere])
+        assert fetcher.wait_for([held, nowhere], 15.0, NEVER) == set()
+        brought = {one.tile_id for one in fetcher.take() if one.status == "blob"}
+        assert len(brought) <= 1
+        fetcher.want([held], besides=[*in_district, nowhere])
+        assert fetcher.wait_for(in_district, 0.5, NEVER) == set(in_district) - brought, "once is enough"
+        fetcher.want(in_district)
+        assert fetcher.wait_for(in_district, 15.0, NEVER) == set()
+    assert fetcher.counts == {"unchanged": 1, "absent": 1, "blob": len(in_district)}

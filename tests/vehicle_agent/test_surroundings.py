@@ -50,7 +50,8 @@ class Scene:
         self.server = TileServer(self.store, cloud).start()
         self.map = LocalMap(GRID_FRAME)
         self.detector = ChangeDetector(self.map)
-        self.fetcher = TileFetcher(bus, TileCache(folder / "cache.sqlite"), PARAMETERS)
+        self.cache = TileCache[Tile](folder / "cache.sqlite")
+        self.fetcher = TileFetcher(bus, self.cache, PARAMETERS)
         self.surroundings = Surroundings(self.map, self.fetcher, self.detector.touched, PARAMETERS)
 
 
@@ -238,3 +239,22 @@ def test_what_the_cache_holds_is_asked_about_farther_ahead(scene: Scene) -> None
     held = scene.map.tile(changed.tile_id)
     assert held is not None
     assert held.version == 2
+
+
+def test_what_is_on_no_map_is_asked_for_once_a_district(scene: Scene) -> None:
+    """A vehicle on a street that it knows, whose course wavers, asks once about each district that it comes to."""
+    for tile in scene.tiles.values():
+        stored = scene.store.get("ndt", tile.tile_id)
+        assert stored is not None
+        scene.cache.put(stored.decode_gaussians())
+    place = at(-20.0)
+    place.speed_mps = 10.0
+    seen = set()
+    for east_m in range(-20, 21):
+        place.position_map_m, place.heading_rad = at(float(east_m)).position_map_m, 0.2 * np.sin(east_m)
+        scene.surroundings.follow(place, NEVER, wait=True)
+        seen |= set(scene.surroundings.wanted)
+    districts = {tile.district for tile in seen}
+    (asked,) = [line.messages for line in scene.ledger.totals() if (line.kind, line.direction) == ("tile", "up")]
+    assert asked <= len(districts)
+    assert len(seen) > len(scene.tiles), "most of them are on no map"

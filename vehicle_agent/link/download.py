@@ -5,6 +5,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Final, Generic
 
 from gnd.fleet_bus.bus import Bus
@@ -35,9 +36,26 @@ MOST_DOUBLINGS = 7
 MOST_TILES = 1024  # of one district
 FIRST_GUESS_BYTES = 4_096
 HELD_GUESS_BYTES = 64
+LEAST_BESIDES_BYTES: Final = 1024
+"""Bodies in the answer to a question that names tiles besides: those that are wanted are expected to be few."""
 
 _log = logging.getLogger(__name__)
 _SELDOM: Final = Seldom(_log)
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    """What is asked at once, of one district.
+
+    Attributes:
+        tiles: that are wanted, the first one most.
+        besides: others of which only that they are on no map is to be heard.
+        max_bytes: of the bodies in the answer.
+    """
+
+    tiles: tuple[TileId, ...]
+    besides: tuple[TileId, ...]
+    max_bytes: int
 
 
 class TileFetcher(Generic[TileT]):
@@ -80,6 +98,8 @@ class TileFetcher(Generic[TileT]):
         self._window_bytes = min(kept_bytes, rate_byte_s * (DOWNLOAD_BATCH_S + 2 * self.link.delay_s))
         self._changed = threading.Condition()
         self._wanted: tuple[TileId, ...] = ()
+        self._besides: tuple[TileId, ...] = ()
+        self._on_a_map: set[TileId] = set()  # asked besides, and there is something
         self._waiting: list[TileId] = []
         self._not_before: dict[TileId, float] = {}
         self._in_flight: dict[TileId, float] = {}  # with the bytes expected
@@ -98,10 +118,16 @@ class TileFetcher(Generic[TileT]):
         for thread in self._threads:
             thread.start()
 
-    def want(self, tiles: Sequence[TileId]) -> None:
-        """These tiles are wanted, the first one most; what was wanted before and is not among them no longer is."""
+    def want(self, tiles: Sequence[TileId], besides: Sequence[TileId] = ()) -> None:
+        """These tiles are wanted, the first one most; what was wanted before and is not among them no longer is.
+
+        Args:
+            tiles: the tiles.
+            besides: tiles that a question about their district names, too, if there is one: that they are on no map
+                costs next to nothing to hear; what is on one is not brought for that.
+        """
         with self._changed:
-            self._wanted = tuple(tiles)
+            self._wanted, self._besides = tuple(tiles), tuple(besides)
             self._line_up()
 
     def refresh(self, tile_id: TileId) -> None:
@@ -137,6 +163,7 @@ class TileFetcher(Generic[TileT]):
             self._answered_s.pop(tile_id, None)
             self._stale.discard(tile_id)
             self._watched.discard(tile_id)
+            self._on_a_map.discard(tile_id)
 
     def take(self) -> list[Fetched[TileT]]:
         """The answers since the last call."""
@@ -209,20 +236,19 @@ class TileFetcher(Generic[TileT]):
             return self._whole.value
 
     def _work(self) -> None:
-        while batch := self._next():
-            outcome = self._try(batch)
+        while question := self._next():
+            outcome = self._try(question)
             done = {fetched.tile_id for fetched in outcome.fetched}
-            instead = self._cached(t for t in batch if t not in done) if not self._closed else {}
+            instead = self._cached(t for t in question.tiles if t not in done) if not self._closed else {}
             with self._changed:
-                for tile_id in batch:
+                for tile_id in (*question.tiles, *question.besides):
                     del self._in_flight[tile_id]
-                self._settle_all(batch, outcome, instead)
+                self._settle_all(question.tiles, outcome, instead)
+                self._on_a_map.update(set(question.besides).intersection(outcome.later))
                 self._line_up()
 
-    def _next(self) -> list[TileId]:
-        """The tiles of the next question: the first that may be asked for now, and more of its district; empty when
-        closed.
-        """
+    def _next(self) -> _Question | None:
+        """The next question: the first tile that may be asked for now, and more of its district; None when closed."""
         with self._changed:
             while not self._closed:
                 now_s = time.monotonic()
@@ -231,9 +257,19 @@ class TileFetcher(Generic[TileT]):
                     batch = self._fitting(t for t in ready if t.district == ready[0].district)
                     self._waiting = [t for t in self._waiting if t not in batch]
                     self._in_flight |= batch
-                    return list(batch)
+                    question = self._question(batch)
+                    self._in_flight |= dict.fromkeys(question.besides, 0.0)
+                    return question
                 self._changed.wait(POLL_S)
-            return []
+            return None
+
+    def _question(self, batch: dict[TileId, float]) -> _Question:
+        """A question about tiles that wait, given with the bytes expected. The lock is held."""
+        district = next(iter(batch)).district
+        done = (self._answered - self._stale) | self._in_flight.keys() | self._on_a_map
+        besides = tuple(t for t in self._besides if t.district == district and t not in done)[: MOST_TILES - len(batch)]
+        expected_bytes = max(LEAST_BESIDES_BYTES, round(2 * sum(batch.values())))
+        return _Question(tuple(batch), besides, min(self._batch_bytes, expected_bytes) if besides else self._batch_bytes)
 
     def _fitting(self, tiles: Iterable[TileId]) -> dict[TileId, float]:
         """The first of `tiles`, and those after it that fit into one answer, with the bytes expected."""
@@ -245,15 +281,16 @@ class TileFetcher(Generic[TileT]):
             batch[tile_id] = expected_bytes
         return batch
 
-    def _try(self, batch: list[TileId]) -> ExchangeOutcome[TileT]:
+    def _try(self, question: _Question) -> ExchangeOutcome[TileT]:
+        batch, asked = question.tiles, (*question.tiles, *question.besides)
         with self._changed:
-            whole = {tile_id for tile_id in batch if self._wrong[tile_id]}
+            whole = {tile_id for tile_id in asked if self._wrong[tile_id]}
         try:
             if self._archive is not None:
                 self._bring(self._archive, [tile_id for tile_id in batch if tile_id not in whole])
             if not self._has_router():
                 return ExchangeOutcome[TileT]()
-            return self._exchange.ask(batch, whole, self._batch_bytes, near=batch[0])
+            return self._exchange.ask(asked, whole, question.max_bytes, near=batch[0])
         except BusClosed:
             return ExchangeOutcome[TileT]()
         except Exception as error:  # whatever it was: a worker that ends would never fetch again
@@ -284,7 +321,7 @@ class TileFetcher(Generic[TileT]):
             _log.warning("nothing to do without an answer: %s", error)
             return {}
 
-    def _settle_all(self, batch: list[TileId], outcome: ExchangeOutcome[TileT], instead: dict[TileId, TileT]) -> None:
+    def _settle_all(self, batch: Sequence[TileId], outcome: ExchangeOutcome[TileT], instead: dict[TileId, TileT]) -> None:
         """Note the answers; what has none waits for its next try. The lock is held."""
         self._watched -= {fetched.tile_id for fetched in outcome.fetched}
         self._watched |= outcome.watched
