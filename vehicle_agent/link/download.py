@@ -36,7 +36,7 @@ MOST_DOUBLINGS = 7
 MOST_TILES = 1024  # of one district
 FIRST_GUESS_BYTES = 4_096
 HELD_GUESS_BYTES = 64
-LEAST_BESIDES_BYTES: Final = 1024
+LEAST_BESIDES_BYTES: Final = 256
 """Bodies in the answer to a question that names tiles besides: those that are wanted are expected to be few."""
 
 _log = logging.getLogger(__name__)
@@ -268,7 +268,7 @@ class TileFetcher(Generic[TileT]):
         district = next(iter(batch)).district
         done = (self._answered - self._stale) | self._in_flight.keys() | self._on_a_map
         besides = tuple(t for t in self._besides if t.district == district and t not in done)[: MOST_TILES - len(batch)]
-        expected_bytes = max(LEAST_BESIDES_BYTES, round(2 * sum(batch.values())))
+        expected_bytes = max(LEAST_BESIDES_BYTES, round(sum(batch.values())))
         return _Question(tuple(batch), besides, min(self._batch_bytes, expected_bytes) if besides else self._batch_bytes)
 
     def _fitting(self, tiles: Iterable[TileId]) -> dict[TileId, float]:
