@@ -178,8 +178,10 @@ class Sealing:
             share = self._granted.grant(heard.share, heard.digest, self.own, heard.asker)
         return self._signer.answer(key, payload, heard.digest, refusal=refusal, share=share).encode()
 
-    def notice(self, key: str, payload: bytes) -> bytes:
-        """Seal a notice: signed, but for one to a single member with whom there is a key."""
+    def notice(self, key: str, payload: bytes) -> bytes | None:
+        """Seal a notice: signed, but for one to a single member with whom there is a key; None where nobody looks."""
+        if _chunk(key, 2) not in NOTICED_BY:
+            return None
         agreed = self._granted.of_name(_chunk(key, 3)) if _chunk(key, 2) in TO_ONE else None
         if agreed is not None and self._is_good(agreed):
             return agreed.notice(key, payload).encode()

@@ -57,6 +57,8 @@ ANSWERED_BY: Final = {
 }
 ASKED_BY: Final = {"change": "vehicle", "state": "vehicle"}
 NOTICED_BY: Final = {"update": "shard", "want": "shard"}
+"""All other notices have no seal: telemetry is believed by the router's rights alone, lists of the authority have a
+signature of their own."""
 TO_ONE: Final = frozenset({"want"})
 """Notices to the member whose name is the fourth chunk of the key; all others are for everybody."""
 PUBLISHERS: Final = frozenset({"tiles", "shard"})

@@ -12,7 +12,7 @@ import click
 from studies.frame.measure import machine, print_figures
 from studies.frame.options import click_options, options_of
 
-NAMES: Final = ("ingest", "poles", "stalled", "outage", "flooder", "herd", "dearest", "signatures")
+NAMES: Final = ("ingest", "poles", "stalled", "outage", "flooder", "herd", "dearest", "signatures", "identity-bytes")
 
 
 def main() -> None:

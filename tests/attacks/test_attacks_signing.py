@@ -156,6 +156,18 @@ def test_notices_of_the_right_part_arrive(scene: Scene) -> None:
         assert late.get(timeout=10) == b"new version"  # what a publisher remembers keeps its seal
 
 
+def test_a_notice_that_nobody_checks_has_no_seal(scene: Scene) -> None:
+    """Telemetry is believed by the router's rights alone: 74 bytes a sample would prove nothing to anybody."""
+    heard: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    with scene.stranger.declare_subscriber("gnd/v1/*/v1/**", heard.put):
+        time.sleep(0.3)
+        scene.vehicle.publish("gnd/v1/traffic/v1", b"sample", kind="telemetry")
+        scene.shard.publish(WANT, b"states", kind="ack")
+        samples = {str(one.key_expr): one for one in (heard.get(timeout=5.0), heard.get(timeout=5.0))}
+    assert samples["gnd/v1/traffic/v1"].attachment is None
+    assert samples[WANT].attachment is not None
+
+
 def test_a_part_without_identity_reads_what_is_sealed(scene: Scene) -> None:
     with scene.join(None) as plain:
         assert plain.request(TILES, b"which", kind="tile") == b"true"

@@ -1,0 +1,74 @@
+"""What seals and TLS add to each message of a vehicle on a known street, and to the messages of a kilometre."""
+
+import tempfile
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gnd.deploy.fleet_identities import make_identities
+from studies.frame.measure import Figure
+from studies.security_study.kilometre import KILOMETRE, KILOMETRE_BEFORE, Said, router, wired
+
+TIMES: Final = 20
+_WAYS: Final = (("plain", "tcp", False), ("seals", "tcp", True), ("seals and TLS", "tls", True))
+_NAMES: Final = {
+    "question": "a question about the map and its answer",
+    "report": "a report and its acknowledgement",
+    "word": "a word to the vehicle",
+    "telemetry": "a sample of telemetry",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Cost:
+    """Mean IP bytes of a message by what it is, over one kind of connection."""
+
+    of: dict[str, float]
+
+    def kilometre(self, said: tuple[Said, ...]) -> float:
+        """IP bytes of these messages; payloads are those of each, all else is the mean."""
+        return sum(self.of[one.what] + one.up + one.down for one in said)
+
+
+def run() -> list[Figure]:
+    """Say each message many times over a real router: without identities, with seals alone, with TLS."""
+    with tempfile.TemporaryDirectory() as folder:
+        identities = make_identities(Path(folder), 1, 1)
+        costs = {name: _cost(protocol, identities, sealed=sealed) for name, protocol, sealed in _WAYS}
+    return [*_by_message(costs), *_by_kilometre(costs)]
+
+
+def _cost(protocol: str, identities: Path, *, sealed: bool) -> _Cost:
+    """What each kind of message costs beside its payload."""
+    of: dict[str, list[float]] = {what: [] for what in _NAMES}
+    with (
+        router(protocol, identities) as (port, _),
+        wired(f"{protocol}/127.0.0.1:{port}", identities if sealed else None) as parts,
+    ):
+        parts.bytes_of(KILOMETRE)  # certificates are shown, keys agreed on
+        for _ in range(TIMES):
+            for one in (KILOMETRE[0], *KILOMETRE[3:5], KILOMETRE[-1]):
+                of[one.what].append(parts.bytes_of((one,)) - one.up - one.down)
+    return _Cost({what: float(np.mean(found)) for what, found in of.items()})
+
+
+def _by_message(costs: dict[str, _Cost]) -> list[Figure]:
+    found = []
+    for what, name in _NAMES.items():
+        plain, seals, tls = (cost.of[what] for cost in costs.values())
+        added = f"seals add {seals - plain:.0f} B, TLS {tls - seals:.0f} B"
+        found.append(Figure(f"{name}, beside the payload, plain", plain, "B", added))
+    return found
+
+
+def _by_kilometre(costs: dict[str, _Cost]) -> list[Figure]:
+    found = []
+    for name, said in (("a kilometre before decision 167", KILOMETRE_BEFORE), ("a kilometre", KILOMETRE)):
+        plain, seals, tls = (cost.kilometre(said) for cost in costs.values())
+        counted = ", ".join(f"{n} x {what}" for what, n in Counter(one.what for one in said).items())
+        added = f"seals add {seals - plain:.0f} B, TLS {tls - seals:.0f} B: {100 * (tls / plain - 1):+.1f} %"
+        found += [Figure(f"{name}, plain", plain, "B", counted), Figure(f"{name}, seals and TLS", tls, "B", added)]
+    return found

@@ -1,0 +1,124 @@
+"""What a vehicle says and hears on a known street, over a real router: by the counters of its connection."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+
+from gnd.deploy.ports import claim_port
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+
+What = Literal["question", "report", "word", "telemetry"]
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """A message of the vehicle, or a word to it, and what comes back.
+
+    Attributes:
+        what: a question about the map; a report; a word of the shard to the vehicle; a sample of telemetry.
+        up: payload bytes from the vehicle.
+        down: payload bytes to it.
+    """
+
+    what: What
+    up: int
+    down: int
+
+
+ACK_BYTES: Final = 32
+_REPORTS: Final = ((183, 28), (80, 24), (195, 28), (91, 24))
+_WITH_REPORTS: Final = tuple(
+    one for up, down in _REPORTS for one in (Said("report", up, ACK_BYTES), Said("word", 0, down))
+)
+_TELEMETRY: Final = (Said("telemetry", 62, 0), Said("telemetry", 159, 0))
+KILOMETRE: Final = (
+    *(Said("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6))),
+    *_WITH_REPORTS,
+    *_TELEMETRY,
+)
+"""Payload bytes as the ledger of `gnd reproduce steady-vehicle --length 1000 --pace 2` (seed 201) has them, without the
+report that the end of the drive makes."""
+_ASKED_BEFORE: Final = ((70, 13), (46, 6), (42, 6), (66, 9), (35, 5), (34, 5), (36, 5), (33, 5), (39, 5))
+KILOMETRE_BEFORE: Final = (*(Said("question", up, down) for up, down in _ASKED_BEFORE), *_WITH_REPORTS, *_TELEMETRY)
+"""The same where tiles on no map were asked about one by one, before decision 167."""
+PAUSE_S: Final = 0.3
+_ASKED: Final = "gnd/v1/tiles/ndt/13033/03021/21000"
+_REPORTED: Final = "gnd/v1/change/ndt/13033/03021/21000"
+_WORD: Final = "gnd/v1/want/vehicle-00"
+
+
+@dataclass(frozen=True, slots=True)
+class Wired:
+    """A vehicle and the two parts of the cloud that it talks with, on one router."""
+
+    vehicle: Bus
+    shard: Bus
+
+    def say(self, one: Said) -> None:
+        """One message, with what comes back; its packets have passed when this returns."""
+        if one.what == "question":
+            self.vehicle.request(_ASKED, one.down.to_bytes(2, "big") + bytes(one.up - 2), kind="tile", timeout_s=20)
+        elif one.what == "report":
+            self.vehicle.request(_REPORTED, bytes(one.up), kind="change", timeout_s=20)
+        elif one.what == "word":
+            self.shard.publish(_WORD, bytes(one.down), kind="ack")
+        else:
+            self.vehicle.publish("gnd/v1/traffic/vehicle-00", bytes(one.up), kind="telemetry")
+        time.sleep(PAUSE_S)
+
+    def bytes_of(self, said: tuple[Said, ...]) -> int:
+        """IP bytes in both directions."""
+        before = self.vehicle.wire()
+        for one in said:
+            self.say(one)
+        after = self.vehicle.wire()
+        return after.up + after.down - before.up - before.down
+
+
+@contextmanager
+def wired(endpoint: str, identities: Path | None) -> Iterator[Wired]:
+    """Parts that serve and listen at a router; `identities`: their folders, None = they have none."""
+    names = ("store", "merger-0", "vehicle-00")
+    store, shard, vehicle = (
+        BusConfig(connect=(endpoint,), link="4g", identity=None if identities is None else identities / name)
+        for name in names
+    )
+    with open_bus(store) as tiles, open_bus(shard) as merger, open_bus(vehicle) as car:
+        tiles.serve("gnd/v1/tiles/**", lambda asked: bytes(int.from_bytes(asked.payload[:2])), complete=True)
+        merger.serve("gnd/v1/change/**", lambda _asked: bytes(ACK_BYTES), complete=True, kind="change")
+        car.subscribe(_WORD, lambda _key, _payload: None, kind="ack")
+        yield Wired(car, merger)
+
+
+@contextmanager
+def router(protocol: str, identities: Path) -> Iterator[tuple[int, int]]:
+    """A router process: its port and its id."""
+    port = claim_port(0)
+    command = [sys.executable, "-m", "gnd.deploy.cli", "router", "--listen", f"{protocol}/127.0.0.1:{port}"]
+    command += ["--identity", str(identities / "router")] if protocol == "tls" else []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603 - our own command
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()
+            yield port, process.pid
+        finally:
+            process.terminate()
+
+
+def kilometres(endpoint: str, identities: Path | None, rounds: int) -> dict[str, float]:
+    """IP bytes of the messages of `KILOMETRE`: the first time on a connection, and again."""
+    with wired(endpoint, identities) as parts:
+        driven = np.array([parts.bytes_of(KILOMETRE) for _ in range(1 + rounds)])
+    return {
+        "first_kilometre_bytes": float(driven[0]),
+        "kilometre_bytes_mean": float(driven[1:].mean()),
+        "kilometre_bytes_max": float(driven[1:].max()),
+    }
