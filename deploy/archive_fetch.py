@@ -7,10 +7,11 @@ from typing import Final
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import District, TileId
-from gnd.schemas.archive import ArchiveEntry, ArchiveIndex
+from gnd.schemas.archive import ArchiveEntry, ArchiveIndex, ArchiveRoot, index_name
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_client.archive import Archive
+from gnd.tile_client.archive_check import ArchiveCheck, SeenStates
 from gnd.tile_client.checking import SeenVersion, VersionCheck
 from gnd.tile_client.errors import ArchiveAway
 from gnd.tile_store.mirroring import MirroredTile, check_mirror, mirror
@@ -33,6 +34,9 @@ class FetchedArchive:
         fetched: ... so many have come, ...
         unsigned: ... of these so many without a signature, or with one that nobody looked at, ...
         wrong: ... and what is wrong with the others; of these what was here stays.
+        signed_by: who has signed the archive; empty: nobody looked at that.
+        number: how often it was published until then; 0: nobody looked.
+        signed_s: when that was, POSIX seconds; 0: nobody looked.
     """
 
     districts: int = 0
@@ -41,6 +45,9 @@ class FetchedArchive:
     fetched: int = 0
     unsigned: int = 0
     wrong: dict[str, str] = field(default_factory=dict)
+    signed_by: str = ""
+    number: int = 0
+    signed_s: int = 0
 
 
 class ArchiveFetcher:
@@ -50,14 +57,24 @@ class ArchiveFetcher:
         archive: where from.
         store: where to; it must take no reports.
         publishers: whose signatures count; None: nobody looks at signatures, and none are kept.
+        seen: which states of archives were seen before.
+        oldest_s: an archive that was signed longer ago is refused, s; None: any age will do.
 
     Raises:
         StoreError: the store takes reports.
     """
 
-    def __init__(self, archive: Archive, store: SqlStore, publishers: Publishers | None) -> None:
+    def __init__(
+        self,
+        archive: Archive,
+        store: SqlStore,
+        publishers: Publishers | None,
+        seen: SeenStates | None = None,
+        oldest_s: float | None = None,
+    ) -> None:
         check_mirror(store)
         self._archive, self._store, self._publishers = archive, store, publishers
+        self._check = None if publishers is None else ArchiveCheck(publishers, seen or SeenStates(), oldest_s)
         self._chains: dict[bytes, bytes] = {}
         self.done = FetchedArchive()
 
@@ -72,24 +89,42 @@ class ArchiveFetcher:
             progress: is told the layer, districts done, and how many there are.
 
         Raises:
-            ArchiveError: the archive, or a part of it, is not to be had.
+            ArchiveError: the archive, or a part of it, is not to be had, or not to be believed.
             StoreError: the store fails.
         """
-        root = self._archive.root()
+        root = self._root()
         for layer in layers or sorted(root.districts):
             districts = [one for one in root.districts.get(layer, ()) if _touches(region, one)]
             for place, district in enumerate(districts, 1):
-                self._district(layer, district, region)
+                self._district(root, layer, district, region)
                 progress(layer, place, len(districts))
         return self.done
 
-    def _district(self, layer: str, district: District, region: Region) -> None:
+    def _root(self) -> ArchiveRoot:
+        """The root of the archive, and who has signed it."""
+        root = self._archive.root()
+        if self._check is not None:
+            self.done.signed_by = self._check.root(self._archive, root)
+            assert root.sealed is not None
+            self.done.number, self.done.signed_s = root.sealed.seal.number, root.sealed.seal.signed_s
+        return root
+
+    def _district(self, root: ArchiveRoot, layer: str, district: District, region: Region) -> None:
         """A pack that was removed since its index was read is no reason to give up: there is a newer index."""
         self.done.districts += 1
         try:
-            self._bring(layer, self._archive.index(layer, district), region)
+            self._bring(layer, self._index(root, layer, district), region)
         except ArchiveAway:
-            self._bring(layer, self._archive.index(layer, district), region)
+            self._bring(layer, self._index(root, layer, district), region)
+
+    def _index(self, root: ArchiveRoot, layer: str, district: District) -> ArchiveIndex | None:
+        index = self._archive.index(layer, district)
+        if self._check is None:
+            return index
+        if index is None:
+            raise self._check.missing(self._archive, index_name(layer, district))
+        self._check.index(self._archive, index, root)
+        return index
 
     def _bring(self, layer: str, index: ArchiveIndex | None, region: Region) -> None:
         if index is None:

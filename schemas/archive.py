@@ -4,6 +4,7 @@ Anything that serves files over HTTP can serve it. What never changes has a name
 `TileReply` with its signature) and certificates. What changes is one small index a district, and the root.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,6 +14,7 @@ from typing import Final
 
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import limits
+from gnd.schemas.archive_seal import DIGEST_BYTES, Sealed, without_seal
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import archive_index_pb2, archive_root_pb2
 from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
@@ -24,7 +26,6 @@ from gnd.schemas.wire import (
     check_sha,
     check_text,
     check_version,
-    parse,
     refusing,
     serialise,
 )
@@ -121,6 +122,8 @@ class ArchiveIndex:
     layer: str
     district: District
     entries: tuple[ArchiveEntry, ...] = ()
+    sealed: Sealed | None = field(default=None, compare=False)
+    """Its seal, of one that was read; None: nobody answers for it."""
 
     def __post_init__(self) -> None:
         check_text("layer", self.layer, LAYER_PATTERN)
@@ -144,7 +147,7 @@ class ArchiveIndex:
         return MappingProxyType({entry.tile: entry for entry in self.entries})
 
     def encode(self) -> bytes:
-        """Bytes of gnd.v1.ArchiveIndex."""
+        """Bytes of gnd.v1.ArchiveIndex, without a seal."""
         number = {pack: place for place, pack in enumerate(self.packs)}
         places = [entry.tile.morton - self.district.first_morton for entry in self.entries]
         message = archive_index_pb2.ArchiveIndex(
@@ -166,12 +169,13 @@ class ArchiveIndex:
     @classmethod
     def decode(cls, data: bytes) -> "ArchiveIndex":
         """The value in `data`; `SchemaError` when it is none."""
-        message = parse(archive_index_pb2.ArchiveIndex, data, limits.MAX_ARCHIVE_INDEX_BYTES)
+        kind = archive_index_pb2.ArchiveIndex
+        message, sealed = without_seal(kind, "index", data, limits.MAX_ARCHIVE_INDEX_BYTES)
         check_major(message, "ArchiveIndex")
         check_length("ArchiveIndex", len(message.places), _TILES, "tiles")
         with refusing("ArchiveIndex"):
             district = District(message.district)
-            return cls(message.layer, district, tuple(_entries(message, district, _packs(message))))
+            return cls(message.layer, district, tuple(_entries(message, district, _packs(message))), sealed)
 
 
 def _packs(message: archive_index_pb2.ArchiveIndex) -> list[Pack]:
@@ -209,18 +213,36 @@ def _entries(
 
 @dataclass(frozen=True, slots=True)
 class ArchiveRoot:
-    """The districts of an archive by layer, each ascending."""
+    """The districts of an archive by layer, each ascending.
+
+    Attributes:
+        districts: of each layer.
+        digests: how the index of each district is named, by layer in the order of `districts`; empty: not told.
+        sealed: its seal, of one that was read; None: nobody answers for it.
+    """
 
     districts: Mapping[str, tuple[District, ...]] = field(default_factory=dict)
+    digests: Mapping[str, tuple[bytes, ...]] = field(default_factory=dict)
+    sealed: Sealed | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         for layer in self.districts:
             check_text("layer", layer, LAYER_PATTERN)
         total = sum(map(len, self.districts.values()))
         check_length("ArchiveRoot", total, limits.MAX_DISTRICTS_OF_ARCHIVE, "districts")
+        counts = {layer: len(some) for layer, some in self.digests.items()}
+        if counts and counts != {layer: len(some) for layer, some in self.districts.items()}:
+            raise BadValue(f"ArchiveRoot with {sum(counts.values())} digests of {total} indexes")
+
+    def digest(self, layer: str, district: District) -> bytes:
+        """How the index of a district is named; empty: not told."""
+        some = self.districts.get(layer, ())
+        place = bisect_left(some, district)
+        is_listed = place < len(some) and some[place] == district
+        return self.digests[layer][place] if is_listed and self.digests else b""
 
     def encode(self) -> bytes:
-        """Bytes of gnd.v1.ArchiveRoot."""
+        """Bytes of gnd.v1.ArchiveRoot, without a seal."""
         layers = sorted(self.districts)
         numbers = [[one.first_morton // _TILES for one in self.districts[layer]] for layer in layers]
         message = archive_root_pb2.ArchiveRoot(
@@ -228,13 +250,15 @@ class ArchiveRoot:
             layers=layers,
             counts=[len(some) for some in numbers],
             districts=[step for some in numbers for step in _steps(some)],
+            digests=b"".join(one for layer in layers for one in self.digests.get(layer, ())),
         )
         return serialise(message, limits.MAX_ARCHIVE_ROOT_BYTES)
 
     @classmethod
     def decode(cls, data: bytes) -> "ArchiveRoot":
         """The value in `data`; `SchemaError` when it is none."""
-        message = parse(archive_root_pb2.ArchiveRoot, data, limits.MAX_ARCHIVE_ROOT_BYTES)
+        kind = archive_root_pb2.ArchiveRoot
+        message, sealed = without_seal(kind, "root", data, limits.MAX_ARCHIVE_ROOT_BYTES)
         check_major(message, "ArchiveRoot")
         check_length("ArchiveRoot", len(message.districts), limits.MAX_DISTRICTS_OF_ARCHIVE, "districts")
         layers, counts = list(message.layers), list(message.counts)
@@ -242,13 +266,13 @@ class ArchiveRoot:
             raise BadValue(
                 f"ArchiveRoot with {len(layers)} layers, {len(counts)} counts and {len(message.districts)} districts"
             )
-        ends = list(accumulate(counts))
+        parts = list(zip(layers, pairwise([0, *accumulate(counts)]), strict=True))
+        digests = _cut("digests", message.digests, DIGEST_BYTES, sum(counts)) if message.digests else []
         with refusing("ArchiveRoot"):
             return cls(
-                {
-                    layer: tuple(map(_district, _sums(message.districts[end - count : end])))
-                    for layer, count, end in zip(layers, counts, ends, strict=True)
-                }
+                {layer: tuple(map(_district, _sums(message.districts[begin:end]))) for layer, (begin, end) in parts},
+                {layer: tuple(digests[begin:end]) for layer, (begin, end) in parts} if digests else {},
+                sealed,
             )
 
 

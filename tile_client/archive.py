@@ -1,7 +1,7 @@
 """An archive of a region on any web server (`gnd map publish`): what it holds, and its tiles, checked.
 
 Neither the server nor what lies between is believed: a tile is taken where its content has its hash and, for who has
-an authority, where one of its publishers has signed it and no newer version was seen.
+an authority, where one of its publishers has signed it and no newer version was seen; its index likewise.
 """
 
 import logging
@@ -32,6 +32,7 @@ from gnd.schemas.archive import (
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.tiles import TileBlob, TileReply, content_of
 from gnd.schemas.version_signature import VersionSignature
+from gnd.tile_client.archive_check import ArchiveCheck, SeenStates
 from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
 from gnd.tile_client.exchange import TileHolder
@@ -242,11 +243,15 @@ class ArchiveTiles(Generic[TileT]):
     Args:
         archive: where from; others may read it, too.
         holder: where to.
-        check: of the versions that come; None: they are taken as they are.
+        check: of the versions that come, and of the archive's indexes; None: they are taken as they are.
+        seen: which states of indexes were seen before.
     """
 
-    def __init__(self, archive: Archive, holder: TileHolder[TileT], check: VersionCheck | None) -> None:
+    def __init__(
+        self, archive: Archive, holder: TileHolder[TileT], check: VersionCheck | None, seen: SeenStates | None = None
+    ) -> None:
         self._archive, self._holder, self._check = archive, holder, check
+        self._indexes = None if check is None else ArchiveCheck(check.publishers, seen or SeenStates())
         self._asking, self._lock = threading.Lock(), threading.Lock()
         self._not_before_s, self._away_s = 0.0, AWAY_S
 
@@ -276,6 +281,8 @@ class ArchiveTiles(Generic[TileT]):
     def _bring(self, district: District, missing: set[TileId]) -> int:
         with self._asking:  # threads that begin together need it once
             index = self._archive.index(self._holder.layer, district, INDEX_KEPT_S)
+        if self._indexes is not None and index is not None:
+            self._indexes.index(self._archive, index)
         entries = [entry for entry in index.entries if entry.tile in missing] if index else []
         brought = 0
         for found in self._archive.tiles(self._holder.layer, entries):

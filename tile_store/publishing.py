@@ -3,9 +3,13 @@
 Packs are written before the index that names them, and an index is replaced as a whole: whoever reads sees a district
 as it was before or as it is now. Whoever is interrupted publishes again; districts that are done stay done. Nothing is
 removed but by `prune`.
+
+Who publishes with an identity signs each index that it writes, and each time the root, which names all indexes: a
+mirror can neither mix states nor pass an older one off as a newer one.
 """
 
 import logging
+import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -32,8 +36,9 @@ from gnd.schemas.archive import (
     pack_name,
     place_of_index,
 )
+from gnd.schemas.archive_seal import ARCHIVE_ID_BYTES, Sealed, SealedPart, digest_of_index, with_seal
 from gnd.schemas.errors import SchemaError
-from gnd.schemas.limits import MAX_PACK_BYTES
+from gnd.schemas.limits import MAX_ARCHIVE_INDEX_BYTES, MAX_ARCHIVE_ROOT_BYTES, MAX_PACK_BYTES
 from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
 from gnd.schemas.tiles import CatalogEntry, TileReply
 from gnd.tile_store.connection import fetch
@@ -41,6 +46,7 @@ from gnd.tile_store.errors import StoreError
 from gnd.tile_store.objects import FolderObjects, NamedObjects
 from gnd.tile_store.regions import morton_range
 from gnd.tile_store.released import released_heads
+from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import NS_PER_S, StoredTile
 
@@ -69,6 +75,7 @@ class Published:
         unsigned: published tiles that nobody has signed.
         set_back: tiles whose published version had a higher number.
         damaged: tiles that cannot be read, and why; what was published of them stays.
+        number: how often the archive was published by somebody who signs; 0: nobody does.
     """
 
     districts: int = 0
@@ -81,6 +88,7 @@ class Published:
     unsigned: int = 0
     set_back: int = 0
     damaged: dict[str, str] = field(default_factory=dict)
+    number: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +114,7 @@ def publish(
     layers: Sequence[str],
     regions: Sequence[str] = ("",),
     progress: Progress = lambda _step, _done, _total: None,
+    signing: Signing | None = None,
 ) -> Published:
     """Bring an archive to the store's released versions.
 
@@ -115,12 +124,15 @@ def publish(
         layers: which layers.
         regions: leading parts of tile paths, whole districts.
         progress: is told the layer, districts done, and how many there are.
+        signing: of who publishes; None: the archive is not signed.
 
     Raises:
-        StoreError: a region that cuts through districts; the store or the objects fail; somebody else publishes there.
+        StoreError: a region that cuts through districts; the store or the objects fail; somebody else publishes there;
+            the archive is signed, and who publishes has no identity.
     """
-    done, writing = Published(), _Writing(store, objects)
+    done = Published()
     with _alone(objects):
+        writing = _Writing(store, objects, signing)
         for layer in layers:
             heads = {
                 head.tile: head
@@ -132,7 +144,7 @@ def publish(
             for place, (district, some) in enumerate(listed, 1):
                 writing.district(layer, district, some, done)
                 progress(layer, place, len(listed))
-        _write_root(objects, done)
+        writing.root(done)
     return done
 
 
@@ -157,9 +169,36 @@ def prune(objects: NamedObjects, older_than_s: float = PRUNED_AFTER_S) -> Pruned
 class _Writing:
     """Writes districts of one store to one archive."""
 
-    def __init__(self, store: SqlStore, objects: NamedObjects) -> None:
-        self._store, self._objects = store, objects
+    def __init__(self, store: SqlStore, objects: NamedObjects, signing: Signing | None) -> None:
+        self._store, self._objects, self._signing = store, objects, signing
         self._certificates = {one.name for one in objects.each(CERTIFICATE_FOLDER)}
+        self._root_data = objects.get(ROOT_NAME)
+        self._root = self._root_before()
+        sealed = self._root.sealed
+        if signing is None and sealed is not None:
+            raise StoreError(
+                f"{objects.location}: the archive is signed; publish with the identity of a shard or an operator"
+                " (--identity FOLDER)"
+            )
+        self._archive = secrets.token_bytes(ARCHIVE_ID_BYTES) if sealed is None else sealed.seal.archive
+        self._digests = dict[tuple[str, District], bytes]()  # of the indexes that were looked at
+
+    def _root_before(self) -> ArchiveRoot:
+        """The root as it was published; who signs takes none that nobody answers for."""
+        try:
+            root = ArchiveRoot() if self._root_data is None else ArchiveRoot.decode(self._root_data)
+        except SchemaError as error:
+            _LOG.warning("%s: %s is none and is written anew: %s", self._objects.location, ROOT_NAME, error)
+            return ArchiveRoot()
+        return root if self._signing is None or self._is_ours(root.sealed) else ArchiveRoot()
+
+    def _is_ours(self, sealed: Sealed | None) -> bool:
+        """Whether one of our publishers answers for a part of the archive."""
+        if self._signing is None or sealed is None:
+            return False
+        signer = sealed.seal.signer
+        is_known = self._signing.publishers.knows(signer)
+        return self._signing.answers_for(sealed, None if is_known else self._objects.get(certificate_name(signer)))
 
     def district(self, layer: str, district: District, heads: Sequence[CatalogEntry], done: Published) -> None:
         """Write what is new of a district, then its index, where anything is."""
@@ -174,11 +213,62 @@ class _Writing:
         if before is None or len(kept) < len(heads) or len(held) > len(heads):
             entries = self._entries(layer, heads, kept, held, done)
             index = ArchiveIndex(layer, district, tuple(sorted(entries, key=lambda entry: entry.tile)))
-            if index != before:
-                self._put(name, index.encode(), done, changes=True)
-                done.switched += 1
             kept = dict(index.by_tile)
+        else:
+            index = before
+        self._write_index(name, index, before, done)
         done.unsigned += sum(entry.signed == UNSIGNED for entry in kept.values())
+
+    def _write_index(self, name: str, index: ArchiveIndex, before: ArchiveIndex | None, done: Published) -> None:
+        """Write an index where it, or who answers for it, has changed."""
+        sealed = None if before is None else before.sealed
+        is_good = self._signing is None or self._is_ours(sealed)
+        if index != before or not is_good:
+            body = index.encode()
+            self._digests[index.layer, index.district] = digest_of_index(sha256(body).digest())
+            data = self._sealed("index", body, sealed if is_good else None, MAX_ARCHIVE_INDEX_BYTES)
+            self._put(name, data, done, changes=True)
+            done.switched += 1
+        elif sealed is not None:
+            self._digests[index.layer, index.district] = digest_of_index(sealed.body_sha)
+
+    def _sealed(self, part: SealedPart, body: bytes, before: Sealed | None, limit: int) -> bytes:
+        """A part as it is written: with a seal where somebody signs."""
+        if self._signing is None:
+            return body
+        seal, chain = self._signing.seal(part, body, self._archive, None if before is None else before.seal)
+        self._put_certificate(seal.signer, chain)
+        return with_seal(part, body, seal, limit)
+
+    def root(self, done: Published) -> None:
+        """Name the districts that have an index: where that has changed; who signs says each time what holds now."""
+        places = sorted(place_of_index(one.name) for one in self._objects.each(INDEX_FOLDER))
+        digests = dict[str, tuple[bytes, ...]]()
+        if self._signing is not None:
+            found = {place: digest for place in places if (digest := self._digest(*place))}
+            digests = {layer: tuple(found[one] for one in some) for layer, some in _by_layer(list(found)).items()}
+            places = list(found)
+        districts = {layer: tuple(one for _, one in some) for layer, some in _by_layer(places).items()}
+        before = self._root.sealed
+        data = self._sealed("root", ArchiveRoot(districts, digests).encode(), before, MAX_ARCHIVE_ROOT_BYTES)
+        if self._root_data != data:
+            self._put(ROOT_NAME, data, done, changes=True)
+        if self._signing is not None:
+            done.number = 1 if before is None else before.seal.number + 1
+
+    def _digest(self, layer: str, district: District) -> bytes:
+        """How an index is named: as it was looked at now, or else as the root names it; only else it is read. Empty: it
+        is not, since none of our publishers answers for it.
+        """
+        known = self._digests.get((layer, district)) or self._root.digest(layer, district)
+        if known:
+            return known
+        name = index_name(layer, district)
+        index = self._published(name)
+        if index is None or index.sealed is None or not self._is_ours(index.sealed):
+            _LOG.warning("%s: %s is not signed, and the root does not name it", self._objects.location, name)
+            return b""
+        return digest_of_index(index.sealed.body_sha)
 
     def _published(self, name: str) -> ArchiveIndex | None:
         data = self._objects.get(name)
@@ -247,11 +337,13 @@ class _Writing:
     def _show_certificate(self, stored: StoredTile) -> None:
         if stored.signature is None:
             return
-        name = certificate_name(stored.signature.signer)
-        if name in self._certificates:
-            return
-        chain = self._store.publisher_chain(stored.signature.signer)
-        if chain is not None:
+        signer = stored.signature.signer
+        if certificate_name(signer) not in self._certificates:
+            self._put_certificate(signer, self._store.publisher_chain(signer))
+
+    def _put_certificate(self, signer: bytes, chain: bytes | None) -> None:
+        name = certificate_name(signer)
+        if chain is not None and name not in self._certificates:
             self._objects.put(name, chain)
             self._certificates.add(name)
 
@@ -259,6 +351,11 @@ class _Writing:
         self._objects.put(name, data, changes=changes)
         done.objects += 1
         done.bytes += len(data)
+
+
+def _by_layer(places: Sequence[tuple[str, District]]) -> dict[str, list[tuple[str, District]]]:
+    """Sorted places of indexes by their layer."""
+    return {layer: list(some) for layer, some in groupby(places, key=lambda one: one[0])}
 
 
 def _alone(objects: NamedObjects) -> AbstractContextManager[None]:
@@ -311,14 +408,3 @@ def _indexes(objects: NamedObjects) -> Iterator[ArchiveIndex]:
             yield ArchiveIndex.decode(data)
         except SchemaError as error:
             raise StoreError(f"{objects.location}: {one.name} is no index, so nothing is removed: {error}") from error
-
-
-def _write_root(objects: NamedObjects, done: Published) -> None:
-    """Name the districts that have an index, where that has changed."""
-    places = sorted(place_of_index(one.name) for one in objects.each(INDEX_FOLDER))
-    layers = {layer: tuple(district for _, district in some) for layer, some in groupby(places, key=lambda one: one[0])}
-    root = ArchiveRoot(layers).encode()
-    if objects.get(ROOT_NAME) != root:
-        objects.put(ROOT_NAME, root, changes=True)
-        done.objects += 1
-        done.bytes += len(root)

@@ -5,6 +5,7 @@ A store in which somebody has signed stays one of signed versions: who has no id
 
 import time
 from collections.abc import Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ from gnd.fleet_bus.errors import IdentityError, NotAnsweredFor, SealError
 from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.publishers import PublisherKey, Publishers
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.archive_seal import ArchiveSeal, Sealed, SealedPart, SealNumber, sealed_text
 from gnd.schemas.version_signature import VersionSignature, VersionStatement
 from gnd.tile_store.connection import SqlConnection, change, fetch, post
 from gnd.tile_store.errors import NotPublished, StoreDamaged
@@ -52,6 +54,41 @@ class Signing:
         except IdentityError as error:
             raise NotPublished(f"nothing can be signed, and so nothing published: {error}") from error
         return VersionSignature(signer, statement.kind, statement.made_s, signed_s, signature), chain
+
+    def seal(
+        self, part: SealedPart, body: bytes, archive: bytes, before: ArchiveSeal | None
+    ) -> tuple[ArchiveSeal, bytes]:
+        """The seal under a part of an archive, and the certificates behind it.
+
+        Args:
+            part: what is signed.
+            body: its bytes.
+            archive: names the archive, 8 bytes.
+            before: the seal of the state that it replaces.
+
+        Raises:
+            NotPublished: the certificate of this process has ended.
+        """
+        # clocks step: what replaces another is not older
+        now_s, body_sha = time.time_ns() // NS_PER_S, sha256(body).digest()
+        order = SealNumber(now_s, 1) if before is None else SealNumber(max(now_s, before.signed_s), before.number + 1)
+        try:
+            signer, signature, chain = self._key.sign(
+                lambda signer: sealed_text(part, body_sha, archive, order, signer), order.signed_s
+            )
+        except IdentityError as error:
+            raise NotPublished(f"the archive cannot be signed: {error}") from error
+        return ArchiveSeal(archive, order.number, order.signed_s, signer, signature), chain
+
+    def answers_for(self, sealed: Sealed, chain: bytes | None) -> bool:
+        """Whether one of our publishers has signed a part of an archive; `chain`: certificates that lie with it."""
+        try:
+            if chain is not None and not self.publishers.knows(sealed.seal.signer):
+                self.publishers.learn(chain)
+            self.publishers.check(sealed.seal.signer, sealed.seal.signed_s, sealed.text, sealed.seal.signature)
+        except SealError:
+            return False
+        return True
 
 
 def columns(c: SqlConnection, signing: Signing | None, row: Mapping[str, Any], day: int) -> dict[str, Any]:

@@ -4,6 +4,7 @@ isort:skip_file
 """
 
 from collections import abc as _abc
+from . import archive_seal_pb2 as _archive_seal_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -39,6 +40,7 @@ class ArchiveIndex(_message.Message):
     PACKS_OF_FIELD_NUMBER: _builtins.int
     STARTS_FIELD_NUMBER: _builtins.int
     SIZES_FIELD_NUMBER: _builtins.int
+    SEAL_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     layer: _builtins.str
@@ -77,6 +79,10 @@ class ArchiveIndex(_message.Message):
     def sizes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """How long its TileReply is. [bytes]"""
 
+    @_builtins.property
+    def seal(self) -> _archive_seal_pb2.ArchiveSeal:
+        """Who answers for all that comes before it in the file; the last field of the file. Missing: nobody does."""
+
     def __init__(
         self,
         *,
@@ -92,10 +98,11 @@ class ArchiveIndex(_message.Message):
         packs_of: _abc.Iterable[_builtins.int] | None = ...,
         starts: _abc.Iterable[_builtins.int] | None = ...,
         sizes: _abc.Iterable[_builtins.int] | None = ...,
+        seal: _archive_seal_pb2.ArchiveSeal | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["seal", b"seal"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["district", b"district", "hashes", b"hashes", "layer", b"layer", "major", b"major", "pack_bytes", b"pack_bytes", "packs", b"packs", "packs_of", b"packs_of", "places", b"places", "signed", b"signed", "sizes", b"sizes", "starts", b"starts", "versions", b"versions"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["district", b"district", "hashes", b"hashes", "layer", b"layer", "major", b"major", "pack_bytes", b"pack_bytes", "packs", b"packs", "packs_of", b"packs_of", "places", b"places", "seal", b"seal", "signed", b"signed", "sizes", b"sizes", "starts", b"starts", "versions", b"versions"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -4,6 +4,7 @@ isort:skip_file
 """
 
 from collections import abc as _abc
+from . import archive_seal_pb2 as _archive_seal_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -28,8 +29,14 @@ class ArchiveRoot(_message.Message):
     LAYERS_FIELD_NUMBER: _builtins.int
     COUNTS_FIELD_NUMBER: _builtins.int
     DISTRICTS_FIELD_NUMBER: _builtins.int
+    DIGESTS_FIELD_NUMBER: _builtins.int
+    SEAL_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
+    digests: _builtins.bytes
+    """SHA-256 of the index of each district, without its seal, the first bytes; in the order of the districts. Empty where
+    nobody has signed. [16 bytes each]
+    """
     @_builtins.property
     def layers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Names of the layers, ascending."""
@@ -44,6 +51,10 @@ class ArchiveRoot(_message.Message):
         as a number (Morton code / 1024), of others the difference from the one before.
         """
 
+    @_builtins.property
+    def seal(self) -> _archive_seal_pb2.ArchiveSeal:
+        """Who answers for all that comes before it in the file; the last field of the file. Missing: nobody does."""
+
     def __init__(
         self,
         *,
@@ -51,10 +62,12 @@ class ArchiveRoot(_message.Message):
         layers: _abc.Iterable[_builtins.str] | None = ...,
         counts: _abc.Iterable[_builtins.int] | None = ...,
         districts: _abc.Iterable[_builtins.int] | None = ...,
+        digests: _builtins.bytes = ...,
+        seal: _archive_seal_pb2.ArchiveSeal | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["seal", b"seal"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "districts", b"districts", "layers", b"layers", "major", b"major"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "digests", b"digests", "districts", b"districts", "layers", b"layers", "major", b"major", "seal", b"seal"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

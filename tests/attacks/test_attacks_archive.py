@@ -1,8 +1,9 @@
 """A mirror of an archive that forges, cuts off, rolls back and never ends: a clear error, and nothing is lost."""
 
 import resource
+import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,9 +17,20 @@ from gnd.deploy.archive_fetch import ArchiveFetcher, FetchedArchive
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.archive import ArchiveEntry, ArchiveIndex, Pack, index_name, pack_name
+from gnd.schemas.archive import (
+    ROOT_NAME,
+    ArchiveEntry,
+    ArchiveIndex,
+    ArchiveRoot,
+    Pack,
+    index_name,
+    pack_name,
+)
+from gnd.schemas.archive_seal import digest_of_index, with_seal
+from gnd.schemas.limits import MAX_ARCHIVE_INDEX_BYTES, MAX_ARCHIVE_ROOT_BYTES
 from gnd.tile_client import http_reader
 from gnd.tile_client.archive import Archive
+from gnd.tile_client.archive_check import SeenStates
 from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
 from gnd.tile_client.http_reader import PATIENT, Patience
 from gnd.tile_store.objects import FolderObjects
@@ -41,11 +53,12 @@ class ArchiveScene:
     mirror: Mirror
     client: SqliteStore
     patience: Patience = PATIENT
+    seen: SeenStates = field(default_factory=SeenStates)
 
-    def fetch(self, *, is_believing: bool = False) -> FetchedArchive:
+    def fetch(self, *, is_believing: bool = False, oldest_s: float | None = None) -> FetchedArchive:
         with Archive(self.mirror.url, patience=self.patience) as archive:
             publishers = None if is_believing else Publishers(self.parts["vehicle"], archive.fetch_certificate)
-            return ArchiveFetcher(archive, self.client, publishers).fetch((), Region(""))
+            return ArchiveFetcher(archive, self.client, publishers, self.seen, oldest_s).fetch((), Region(""))
 
     def serve(self, objects: FolderObjects) -> None:
         self.mirror.folder = Path(objects.location)
@@ -54,6 +67,19 @@ class ArchiveScene:
         data = objects.get(INDEX)
         assert data is not None
         return ArchiveIndex.decode(data)
+
+    def put_index(self, objects: FolderObjects, index: ArchiveIndex, signer: str = "operator") -> None:
+        """Write an index as somebody would who has that identity, and the root that names it."""
+        signing, root = Signing(self.parts[signer]), ArchiveRoot.decode(objects.get(ROOT_NAME) or b"")
+        before = self.index(objects).sealed
+        assert before is not None
+        assert root.sealed is not None
+        seal, _ = signing.seal("index", index.encode(), before.seal.archive, before.seal)
+        objects.put(INDEX, with_seal("index", index.encode(), seal, MAX_ARCHIVE_INDEX_BYTES))
+        digest = digest_of_index(sha256(index.encode()).digest())
+        body = ArchiveRoot(root.districts, {LAYER: (digest,)}).encode()
+        seal, _ = signing.seal("root", body, root.sealed.seal.archive, root.sealed.seal)
+        objects.put(ROOT_NAME, with_seal("root", body, seal, MAX_ARCHIVE_ROOT_BYTES))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +96,9 @@ def scene(tmp_path: Path, parts: dict[str, Path]) -> Iterator[ArchiveScene]:
     with SqliteStore(tmp_path / "map.sqlite", signing=Signing(parts["operator"])) as store:
         for objects, seed in ((old, 1), (new, 100)):
             store.put_tiles([content(tile, seed + n) for n, tile in enumerate(TILES)])
-            publish(store, objects, [LAYER])
+            if objects is new:  # the same archive, later
+                shutil.copytree(old.location, new.location, dirs_exist_ok=True)
+            publish(store, objects, [LAYER], signing=Signing(parts["operator"]))
     with SqliteStore(tmp_path / "client.sqlite") as client, mirror_of(tmp_path / "new") as mirror:
         yield ArchiveScene(tmp_path, parts, old, new, mirror, client)
 
@@ -84,6 +112,7 @@ def test_an_older_state_takes_nothing_away(scene: ArchiveScene) -> None:
     scene.fetch()
     before = scene.client.heads()
     scene.serve(scene.old)
+    scene.seen = SeenStates()  # what was seen of the archive is lost; the tiles are not
     done = scene.fetch()
     assert len(done.wrong) == 4
     assert all("version 1 is offered, version 2 is here" in why for why in done.wrong.values())
@@ -97,20 +126,23 @@ def test_an_old_version_under_a_new_number_is_refused(scene: ArchiveScene) -> No
     before = scene.client.heads()
     index = scene.index(scene.old)
     entries = tuple(ArchiveEntry(e.tile, 3, e.hash, e.signed, e.pack, e.start, e.size) for e in index.entries)
-    scene.old.put(INDEX, ArchiveIndex(LAYER, index.district, entries).encode())
+    scene.put_index(scene.old, ArchiveIndex(LAYER, index.district, entries))
     scene.serve(scene.old)
+    scene.seen = SeenStates()
     assert all("another tile or version lies there" in why for why in scene.fetch().wrong.values())
     assert scene.client.heads() == before
 
 
 def forged(scene: ArchiveScene, signer: str | None) -> FetchedArchive:
-    """An archive of another world, version 3, signed by somebody who may not, or by nobody."""
+    """An archive of another world, version 3, its tiles signed by who may not, or by nobody; its index and root are signed
+    by an operator who was deceived.
+    """
     objects = FolderObjects(scene.folder / "forged")
     signing = None if signer is None else Signing(scene.parts[signer])
     with SqliteStore(scene.folder / "forged.sqlite", signing=signing) as store:
         for seed in (1, 2, 3):
             store.put_tiles([content(tile, 1000 + seed) for tile in TILES])
-        publish(store, objects, [LAYER])
+        publish(store, objects, [LAYER], signing=Signing(scene.parts["operator"]))
     scene.serve(objects)
     return scene.fetch()
 
@@ -135,7 +167,7 @@ def test_a_good_signature_over_other_content_is_refused(scene: ArchiveScene) -> 
         ArchiveEntry(first.tile, 2, second.hash, second.signed, second.pack, second.start, second.size),
         *index.entries[1:],
     )
-    scene.new.put(INDEX, ArchiveIndex(LAYER, index.district, entries).encode())
+    scene.put_index(scene.new, ArchiveIndex(LAYER, index.district, entries))
     done = scene.fetch()
     assert list(done.wrong) == [f"{LAYER} {first.tile.path}"]
     assert "another tile or version lies there" in done.wrong[f"{LAYER} {first.tile.path}"]
@@ -166,7 +198,7 @@ def test_a_pack_that_is_not_there_is_an_error(scene: ArchiveScene) -> None:
     gone = Pack(sha256(b"gone").digest(), 1000)
     index = scene.index(scene.new)
     entries = tuple(ArchiveEntry(e.tile, 2, e.hash, e.signed, gone, 0, 500) for e in index.entries)
-    scene.new.put(INDEX, ArchiveIndex(LAYER, index.district, entries).encode())
+    scene.put_index(scene.new, ArchiveIndex(LAYER, index.district, entries))
     with pytest.raises(ArchiveAway, match=f"{pack_name(gone.sha)}: not there, though an index names it"):
         scene.fetch()
 
@@ -233,7 +265,7 @@ def test_what_came_before_it_failed_is_kept(scene: ArchiveScene, hurried: None) 
     """The second pack never comes; the first one is in the store."""
     with SqliteStore(scene.folder / "map.sqlite", signing=Signing(scene.parts["operator"])) as store:
         store.put_tiles([content(TILES[0], 500)])
-        publish(store, scene.new, [LAYER])
+        publish(store, scene.new, [LAYER], signing=Signing(scene.parts["operator"]))
     packs = sorted(scene.index(scene.new).packs, key=lambda pack: pack.sha)
     assert len(packs) == 2
     scene.mirror.wrong[pack_name(packs[1].sha)] = mirrors.broken

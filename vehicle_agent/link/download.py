@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, Generic
 
 from gnd.fleet_bus.bus import Bus
@@ -16,6 +17,7 @@ from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.content import TileT
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.tile_client.archive import Archive, ArchiveTiles
+from gnd.tile_client.archive_check import SeenStates
 from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.exchange import Exchange, ExchangeOutcome, Fetched
 from gnd.vehicle_agent.config import DownloadParameters
@@ -67,7 +69,8 @@ class TileFetcher(Generic[TileT]):
     on where it was.
 
     With an archive what the cache has nothing of is brought from there first; then the bus is asked as if it had been
-    held for long: it answers with what is newer, or with nothing.
+    held for long: it answers with what is newer, or with nothing. `archives_seen`: where it is kept which states of
+    archives were seen; None: nowhere.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class TileFetcher(Generic[TileT]):
         parameters: DownloadParameters,
         ticket: int = 0,
         archive: Archive | None = None,
+        archives_seen: Path | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.last_error = ""
@@ -86,7 +90,7 @@ class TileFetcher(Generic[TileT]):
         self.check = VersionCheck.on_the_bus(bus, cache.layer, cache)
         self._archive: ArchiveTiles[TileT] | None = None
         if archive is not None:
-            self._archive = ArchiveTiles(archive, cache, self.check)
+            self._archive = ArchiveTiles(archive, cache, self.check, SeenStates(archives_seen))
         # One attempt may take all the time there is: a second one would fetch a slow answer twice.
         self._exchange: Exchange[TileT] = Exchange(
             bus, cache, parameters.request_s, parameters.request_s, ticket=ticket, check=self.check
@@ -269,7 +273,9 @@ class TileFetcher(Generic[TileT]):
         done = (self._answered - self._stale) | self._in_flight.keys() | self._on_a_map
         besides = tuple(t for t in self._besides if t.district == district and t not in done)[: MOST_TILES - len(batch)]
         expected_bytes = max(LEAST_BESIDES_BYTES, round(sum(batch.values())))
-        return _Question(tuple(batch), besides, min(self._batch_bytes, expected_bytes) if besides else self._batch_bytes)
+        return _Question(
+            tuple(batch), besides, min(self._batch_bytes, expected_bytes) if besides else self._batch_bytes
+        )
 
     def _fitting(self, tiles: Iterable[TileId]) -> dict[TileId, float]:
         """The first of `tiles`, and those after it that fit into one answer, with the bytes expected."""
@@ -321,7 +327,9 @@ class TileFetcher(Generic[TileT]):
             _log.warning("nothing to do without an answer: %s", error)
             return {}
 
-    def _settle_all(self, batch: Sequence[TileId], outcome: ExchangeOutcome[TileT], instead: dict[TileId, TileT]) -> None:
+    def _settle_all(
+        self, batch: Sequence[TileId], outcome: ExchangeOutcome[TileT], instead: dict[TileId, TileT]
+    ) -> None:
         """Note the answers; what has none waits for its next try. The lock is held."""
         self._watched -= {fetched.tile_id for fetched in outcome.fetched}
         self._watched |= outcome.watched

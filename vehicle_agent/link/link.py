@@ -13,6 +13,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.schemas.keys import alive_key
 from gnd.schemas.ticket import ticket_of
 from gnd.tile_client.archive import Archive
+from gnd.tile_client.archive_check import SEEN_FILE
 from gnd.tile_client.http_reader import HURRIED
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.link.cache import TileCache
@@ -69,7 +70,8 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
         _log.warning("%s: no router at %s for %g s: off on the cache", config.vehicle, where, config.open_timeout_s)
     bus.declare_alive(alive_key("agent", config.vehicle))
     follow_revoked(bus)  # or versions of a publisher that was shut out would still count here
-    fetcher = TileFetcher(bus, cache, config.download, ticket_of(config.vehicle), archive)
+    seen = config.work_dir / SEEN_FILE
+    fetcher = TileFetcher(bus, cache, config.download, ticket_of(config.vehicle), archive, seen)
     sender = SenderThread(bus, outbox, config.vehicle)
     try:
         yield Link(bus, ledger, cache, outbox, fetcher, sender, archive)
