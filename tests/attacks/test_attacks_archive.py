@@ -1,9 +1,11 @@
 """A mirror of an archive that forges, cuts off, rolls back and never ends: a clear error, and nothing is lost."""
 
+import json
 import resource
 import shutil
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from versions_scene import FIRST, LAYER, content
 from gnd.deploy.archive_fetch import ArchiveFetcher, FetchedArchive
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.region import Region
+from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.archive import (
     ROOT_NAME,
@@ -23,20 +26,23 @@ from gnd.schemas.archive import (
     ArchiveIndex,
     ArchiveRoot,
     Pack,
+    certificate_name,
     index_name,
     pack_name,
 )
 from gnd.schemas.archive_seal import digest_of_index, with_seal
 from gnd.schemas.limits import MAX_ARCHIVE_INDEX_BYTES, MAX_ARCHIVE_ROOT_BYTES
 from gnd.tile_client import http_reader
-from gnd.tile_client.archive import Archive
+from gnd.tile_client.archive import Archive, ArchiveTiles
 from gnd.tile_client.archive_check import SeenStates
+from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
 from gnd.tile_client.http_reader import PATIENT, Patience
 from gnd.tile_store.objects import FolderObjects
 from gnd.tile_store.publishing import publish
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.link.cache import TileCache
 
 TILES = [TileId(FIRST.morton + n) for n in range(4)]
 INDEX = index_name(LAYER, FIRST.district)
@@ -134,8 +140,8 @@ def test_an_old_version_under_a_new_number_is_refused(scene: ArchiveScene) -> No
 
 
 def forged(scene: ArchiveScene, signer: str | None) -> FetchedArchive:
-    """An archive of another world, version 3, its tiles signed by who may not, or by nobody; its index and root are signed
-    by an operator who was deceived.
+    """An archive of another world, version 3, its tiles signed by who may not, or by nobody; index and root are signed by
+    an operator who was deceived.
     """
     objects = FolderObjects(scene.folder / "forged")
     signing = None if signer is None else Signing(scene.parts[signer])
@@ -276,3 +282,152 @@ def test_what_came_before_it_failed_is_kept(scene: ArchiveScene, hurried: None) 
     scene.mirror.wrong.clear()
     done = scene.fetch()
     assert (done.unchanged, done.fetched) == (kept, 4 - kept)
+
+
+def test_attack_a_mirror_goes_back_to_an_older_state(scene: ArchiveScene, tmp_path: Path) -> None:
+    """It is noticed by who has seen the newer one, also after a new start, and named before a tile is looked at."""
+    kept = tmp_path / "archives_seen.json"
+    scene.seen = SeenStates(kept)
+    scene.fetch()
+    before = scene.client.heads()
+    scene.serve(scene.old)
+    scene.seen = SeenStates(kept)
+    with pytest.raises(
+        ArchiveWrong, match=r"archive\.gnd: an older state: number 1, signed .* number 2"
+    ):
+        scene.fetch()
+    assert scene.client.heads() == before
+    assert scene.fetch(is_believing=True).wrong, "without an authority the numbers of the tiles are all there is"
+
+
+def test_attack_an_old_index_under_the_root_of_now(scene: ArchiveScene) -> None:
+    old = scene.old.get(INDEX)
+    assert old is not None
+    time.sleep(1.1)
+    with SqliteStore(scene.folder / "map.sqlite", signing=Signing(scene.parts["operator"])) as store:
+        publish(store, scene.new, [LAYER], signing=Signing(scene.parts["operator"]))
+    scene.mirror.wrong["index/"] = mirrors.instead(old)
+    with pytest.raises(ArchiveWrong, match=r"not the index that the archive's root names, and signed \d+ s before"):
+        scene.fetch()
+    assert scene.client.heads() == []
+
+
+def test_a_publisher_at_work_is_no_attack(scene: ArchiveScene) -> None:
+    """Indexes are written before the root: one that is newer than the root is taken."""
+    root = scene.old.get(ROOT_NAME)
+    assert root is not None
+    scene.mirror.wrong["archive.gnd"] = mirrors.instead(root)
+    assert scene.fetch().fetched == 4
+
+
+def test_attack_an_index_is_withheld(scene: ArchiveScene) -> None:
+    scene.mirror.wrong["index/"] = lambda handler, _data: handler.whole(b"", status=404)
+    with pytest.raises(ArchiveAway, match=r"not there, though the root names it: withheld"):
+        scene.fetch()
+
+
+@pytest.mark.parametrize("where", ["archive.gnd", "index/"])
+@pytest.mark.parametrize("what", ["left out", "unsigned", "more behind", "more between", "seal cut", "bit", "number"])
+def test_attack_altered_by_the_mirror(scene: ArchiveScene, where: str, what: str) -> None:
+    name = ROOT_NAME if where == "archive.gnd" else INDEX
+    data = scene.new.get(name)
+    assert data is not None
+    kind = ArchiveRoot if name == ROOT_NAME else ArchiveIndex
+    one = kind.decode(data)
+    assert one.sealed is not None
+    body, seal = one.encode(), one.sealed.seal
+    part, limit = one.sealed.part, MAX_ARCHIVE_ROOT_BYTES
+    empty = (ArchiveRoot() if isinstance(one, ArchiveRoot) else replace(one, entries=one.entries[:-1])).encode()
+    altered = {
+        "left out": with_seal(part, empty, seal, limit),
+        "unsigned": body,
+        "more behind": data + b"\x0a\x00",
+        "more between": body + b"\x0a\x00" + data[len(body) :],
+        "seal cut": data[:-1],
+        "bit": bytes([*data[:-30], data[-30] ^ 1, *data[-29:]]),
+        "number": with_seal(part, body, replace(seal, number=seal.number + 7, signed_s=seal.signed_s + 1), limit),
+    }[what]
+    scene.mirror.wrong[where] = mirrors.instead(altered)
+    why = {"unsigned": "nobody has signed it", "seal cut": "truncated", "bit": "does not fit|signed|archive seal|known"}
+    with pytest.raises(ArchiveError, match=why.get(what, "does not fit|are not signed")):
+        scene.fetch()
+    assert scene.client.heads() == []
+
+
+def test_attack_the_seal_of_an_index_under_a_root(scene: ArchiveScene) -> None:
+    """A seal says what it is of: one over the same bytes as another kind of object is none."""
+    root = ArchiveRoot.decode(scene.new.get(ROOT_NAME) or b"")
+    assert root.sealed is not None
+    seal, _ = Signing(scene.parts["operator"]).seal("index", root.encode(), root.sealed.seal.archive, root.sealed.seal)
+    forged_root = with_seal("root", root.encode(), seal, MAX_ARCHIVE_ROOT_BYTES)
+    scene.mirror.wrong["archive.gnd"] = mirrors.instead(forged_root)
+    with pytest.raises(ArchiveWrong, match="does not fit"):
+        scene.fetch()
+
+
+def test_attack_a_publisher_of_another_authority_signs_the_archive(scene: ArchiveScene) -> None:
+    scene.put_index(scene.new, scene.index(scene.new), "foreign")
+    chain = Signing(scene.parts["foreign"]).seal("root", b"x", bytes(8), None)
+    scene.new.put(certificate_name(chain[0].signer), chain[1])
+    with pytest.raises(ArchiveWrong, match="not of our authority"):
+        scene.fetch()
+
+
+def test_attack_a_revoked_publisher_signs_the_archive(scene: ArchiveScene, tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "own")
+    operator, vehicle = authority.part("operator", "o"), authority.part("vehicle", "v")
+    objects = FolderObjects(tmp_path / "own-archive")
+    with SqliteStore(tmp_path / "own.sqlite", signing=Signing(operator)) as store:
+        store.put_tiles([content(tile, 7) for tile in TILES])
+        publish(store, objects, [LAYER], signing=Signing(operator))
+    scene.serve(objects)
+    scene.parts = scene.parts | {"vehicle": vehicle}
+    assert scene.fetch().fetched == 4
+    authority.revoke(operator, vehicle)
+    with pytest.raises(ArchiveWrong, match=r"archive\.gnd: the certificate of operator o was revoked"):
+        scene.fetch()
+
+
+def test_an_old_mirror_is_named_to_who_asks_for_a_new_one(scene: ArchiveScene) -> None:
+    """A new client has seen nothing; when the archive was signed is told all the same."""
+    done = scene.fetch(oldest_s=3600.0)
+    assert (done.fetched, done.number, done.signed_by) == (4, 2, "operator operator1")
+    assert time.time() - done.signed_s < 600
+    time.sleep(1.1)
+    with pytest.raises(ArchiveWrong, match=r"signed 0\.0 h ago, at most 0\.0 h are wanted: an old mirror"):
+        scene.fetch(oldest_s=0.5)
+
+
+@pytest.mark.parametrize("what", ["good", "unsigned", "older"])
+def test_a_vehicle_takes_no_tiles_by_an_index_that_nobody_answers_for(scene: ArchiveScene, what: str) -> None:
+    """It leaves the archive alone, and asks the bus for all."""
+    cache: TileCache[Tile] = TileCache(scene.folder / "cache.sqlite", LAYER)
+    kept = scene.folder / "seen.json"
+
+    def bring(tiles: list[TileId]) -> tuple[int, bool]:
+        with Archive(scene.mirror.url) as archive:
+            check = VersionCheck(Publishers(scene.parts["vehicle"]), LAYER, cache)
+            vehicle = ArchiveTiles(archive, cache, check, SeenStates(kept))
+            return vehicle.bring(tiles), vehicle.is_left_alone
+
+    assert bring(TILES[:1]) == (1, False)
+    if what == "unsigned":
+        scene.mirror.wrong["index/"] = mirrors.instead(scene.index(scene.new).encode())
+    elif what == "older":
+        scene.serve(scene.old)
+    assert bring(TILES[1:]) == ((3, False) if what == "good" else (0, True))
+    cache.close()
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b'{"a": 1}', b'{"a": [1]}', b"\xff", b"[" * 100_000])
+def test_a_memory_of_archives_that_is_none_stops_nobody(scene: ArchiveScene, data: bytes) -> None:
+    kept = scene.folder / "seen.json"
+    kept.write_bytes(data)
+    scene.seen = SeenStates(kept)
+    assert scene.fetch().fetched == 4
+    assert SeenStates(kept).newest(next(iter(json.loads(kept.read_bytes())))).number >= 1
+
+
+def test_a_folder_that_cannot_be_written_stops_nobody(scene: ArchiveScene) -> None:
+    scene.seen = SeenStates(scene.folder / "not-there" / "seen.json")
+    assert scene.fetch().fetched == 4
