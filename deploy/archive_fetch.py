@@ -13,7 +13,7 @@ from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_client.archive import Archive
 from gnd.tile_client.archive_check import ArchiveCheck, SeenStates
 from gnd.tile_client.checking import SeenVersion, VersionCheck
-from gnd.tile_client.errors import ArchiveAway
+from gnd.tile_client.errors import ArchiveAway, ArchiveStale
 from gnd.tile_store.mirroring import MirroredTile, check_mirror, mirror
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import NS_PER_S
@@ -114,7 +114,7 @@ class ArchiveFetcher:
         self.done.districts += 1
         try:
             self._bring(layer, self._index(root, layer, district), region)
-        except ArchiveAway:
+        except (ArchiveAway, ArchiveStale):
             self._bring(layer, self._index(root, layer, district), region)
 
     def _index(self, root: ArchiveRoot, layer: str, district: District) -> ArchiveIndex | None:

@@ -18,7 +18,7 @@ from gnd.fleet_bus.identity.lists import replace_file
 from gnd.fleet_bus.publishers import Publishers
 from gnd.schemas.archive import ROOT_NAME, ArchiveIndex, ArchiveRoot, index_name
 from gnd.schemas.archive_seal import Sealed, SealNumber, digest_of_index
-from gnd.tile_client.errors import ArchiveAway, ArchiveWrong
+from gnd.tile_client.errors import ArchiveAway, ArchiveStale, ArchiveWrong
 
 if TYPE_CHECKING:
     from gnd.tile_client.archive import Archive
@@ -114,7 +114,8 @@ class ArchiveCheck:
             root: of the same archive, checked; None: there is none at hand.
 
         Raises:
-            ArchiveWrong: nobody who may has signed it, it is an older one than was seen, or not the one of the root.
+            ArchiveStale: the root names a newer one.
+            ArchiveWrong: nobody who may has signed it, or it is an older one than was seen.
         """
         name = index_name(index.layer, index.district)
         where = f"{archive.url}{name}"
@@ -125,7 +126,7 @@ class ArchiveCheck:
             return
         came, held = index.sealed.seal, root.sealed.seal
         if came.archive != held.archive or came.signed_s < held.signed_s:
-            raise ArchiveWrong(
+            raise ArchiveStale(
                 f"{where}: not the index that the archive's root names, and signed {held.signed_s - came.signed_s} s"
                 " before it: an older state"
             )

@@ -3,7 +3,8 @@
 GndError
 └── ArchiveError          an archive, or a part of it, is not to be had
     ├── ArchiveAway       nobody answers, or not in time; another try may help
-    └── ArchiveWrong      what came is not what it should be: too long, cut off, of another tile
+    └── ArchiveWrong      what came is not what it should be: too long, cut off, of another tile, not signed
+        └── ArchiveStale  what came was right once; another try helps where a cache was behind
 """
 
 from gnd.gnd_map.errors import GndError
@@ -19,3 +20,7 @@ class ArchiveAway(ArchiveError):
 
 class ArchiveWrong(ArchiveError):
     """What came is not what it should be."""
+
+
+class ArchiveStale(ArchiveWrong):
+    """What came is an older state than another part of the archive names."""

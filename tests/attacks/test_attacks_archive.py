@@ -292,9 +292,7 @@ def test_attack_a_mirror_goes_back_to_an_older_state(scene: ArchiveScene, tmp_pa
     before = scene.client.heads()
     scene.serve(scene.old)
     scene.seen = SeenStates(kept)
-    with pytest.raises(
-        ArchiveWrong, match=r"archive\.gnd: an older state: number 1, signed .* number 2"
-    ):
+    with pytest.raises(ArchiveWrong, match=r"archive\.gnd: an older state: number 1, signed .* number 2"):
         scene.fetch()
     assert scene.client.heads() == before
     assert scene.fetch(is_believing=True).wrong, "without an authority the numbers of the tiles are all there is"

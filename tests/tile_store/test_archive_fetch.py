@@ -5,15 +5,16 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 from store_helpers import FAR, TILE, tile_of_voxels
 from web_fixtures import ServedFolder
 
 from gnd.deploy.archive_fetch import ArchiveFetcher, FetchedArchive
 from gnd.deploy.map_cli import map_group
 from gnd.fleet_bus.identity.authority import Authority
-from gnd.fleet_bus.identity.names import MemberName
+from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE, MemberName
 from gnd.fleet_bus.ledger import Ledger
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.region import Region, parse_region
@@ -59,7 +60,7 @@ def test_a_mirror_has_what_was_published_with_its_signatures(
     served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path
 ) -> None:
     store.rollback("ndt", FAR, 1)
-    publish(store, FolderObjects(served.folder), ["ndt"])
+    publish(store, FolderObjects(served.folder), ["ndt"], signing=Signing(parts / "anna"))
     with SqliteStore(tmp_path / "mirror.sqlite") as mirror:
         done = fetched(served, mirror, parts)
         assert (done.tiles, done.fetched, done.unsigned, done.wrong) == (31, 31, 0, {})
@@ -79,7 +80,7 @@ def test_a_mirror_is_brought_up_to_date_with_few_requests(
     served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path
 ) -> None:
     objects = FolderObjects(served.folder)
-    publish(store, objects, ["ndt"])
+    publish(store, objects, ["ndt"], signing=Signing(parts / "anna"))
     with SqliteStore(tmp_path / "mirror.sqlite") as mirror:
         before = served.server.requests()
         fetched(served, mirror, parts)
@@ -87,9 +88,9 @@ def test_a_mirror_is_brought_up_to_date_with_few_requests(
         assert served.server.requests() - before <= 7
         before = served.server.requests()
         assert fetched(served, mirror, parts).fetched == 0
-        assert served.server.requests() - before == 3  # root and indexes
+        assert served.server.requests() - before == 4  # root, indexes, and the certificate of who has signed them
         store.put_tiles([tile_of_voxels(TILES[5], 1, 2, 3)])
-        publish(store, objects, ["ndt"])
+        publish(store, objects, ["ndt"], signing=Signing(parts / "anna"))
         done = fetched(served, mirror, parts)
         assert (done.fetched, done.unchanged, done.wrong) == (1, 30, {})
         assert mirror.heads() == store.heads()
@@ -99,7 +100,7 @@ def test_a_mirror_is_brought_up_to_date_with_few_requests(
 def test_only_the_tiles_of_a_region_are_read(
     served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path
 ) -> None:
-    publish(store, FolderObjects(served.folder), ["ndt"])
+    publish(store, FolderObjects(served.folder), ["ndt"], signing=Signing(parts / "anna"))
     ledger = Ledger()
     with SqliteStore(tmp_path / "mirror.sqlite") as mirror, Archive(served.url, ledger) as archive:
         fetcher = ArchiveFetcher(archive, mirror, Publishers(parts / "v1", archive.fetch_certificate))
@@ -118,13 +119,13 @@ def test_a_pack_that_was_pruned_meanwhile_is_found_through_the_newer_index(
     served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path
 ) -> None:
     objects = FolderObjects(served.folder)
-    publish(store, objects, ["ndt"], [TILE.district.path])
+    publish(store, objects, ["ndt"], [TILE.district.path], signing=Signing(parts / "anna"))
     with Archive(served.url) as archive:
         old = archive.index("ndt", TILE.district)
     assert old is not None
     assert old.entries[0].version == 1
     store.put_tiles([tile_of_voxels(tile, 1, 2, 3) for tile in TILES])
-    publish(store, objects, ["ndt"], [TILE.district.path])
+    publish(store, objects, ["ndt"], [TILE.district.path], signing=Signing(parts / "anna"))
 
     class Late(Archive):
         """Has read the index a moment before."""
@@ -146,7 +147,7 @@ def test_readers_see_whole_districts_while_they_are_published(
     served: ServedFolder, store: SqliteStore, parts: Path
 ) -> None:
     objects, stop, wrong, seen = FolderObjects(served.folder), threading.Event(), list[str](), set[int]()
-    publish(store, objects, ["ndt"])
+    publish(store, objects, ["ndt"], signing=Signing(parts / "anna"))
 
     def read() -> None:
         with Archive(served.url) as archive:
@@ -163,7 +164,7 @@ def test_readers_see_whole_districts_while_they_are_published(
     reader.start()
     for n in range(200):
         store.put_tiles([tile_of_voxels(tile, 1, 2, n + 3) for tile in TILES])
-        publish(store, objects, ["ndt"])
+        publish(store, objects, ["ndt"], signing=Signing(parts / "anna"))
         if len(seen) > 3:
             break
     stop.set()
@@ -172,27 +173,48 @@ def test_readers_see_whole_districts_while_they_are_published(
     assert len(seen) > 3
 
 
-def test_the_commands(served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path) -> None:
-    run = CliRunner().invoke
-    told = run(map_group, ["publish", str(store.path), "-o", str(served.folder), "--prune", "--json"])
-    assert told.exit_code == 0, told.output
-    assert json.loads(told.stdout)["tiles"] == 31
+def test_the_commands(
+    served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(command: click.Group, arguments: list[str]) -> Result:
+        monkeypatch.setenv(IDENTITY_VARIABLE, "")  # --identity sets it for the process
+        return CliRunner().invoke(command, arguments)
+
+    publishing = ["publish", str(store.path), "-o", str(served.folder), "--json"]
+    assert json.loads(run(map_group, publishing).stdout)["number"] == 0
     mirror, identity = tmp_path / "mirror.sqlite", str(parts / "v1")
     fetch = ["fetch", served.url, "-o", str(mirror), "--json"]
+    told = run(map_group, [*fetch, "--identity", identity])
+    assert told.exit_code != 0
+    assert "archive.gnd: nobody has signed it" in str(told.exception)
+    told = run(map_group, [*publishing, "--prune", "--identity", str(parts / "anna")])
+    assert told.exit_code == 0, told.output
+    found = json.loads(told.stdout)
+    assert (found["tiles"], found["written"], found["number"]) == (31, 0, 1)
+    told = run(map_group, publishing)
+    assert told.exit_code != 0
+    assert "the archive is signed; publish with the identity of a shard or an operator" in str(told.exception)
+    told = run(map_group, [*publishing, "--identity", identity])
+    assert told.exit_code != 0
+    assert "vehicle.v1" in str(told.exception)
+    told = run(map_group, [*fetch, "--not-older-than", "1"])
+    assert "--not-older-than needs --identity" in told.output
     told = run(map_group, [*fetch, "--identity", identity, "--tiles", TILE.path])
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout)["fetched"] == 1
-    told = run(map_group, [*fetch, "--identity", identity])
+    told = run(map_group, [*fetch, "--identity", identity, "--not-older-than", "1"])
     assert json.loads(told.stdout)["fetched"] == 30
+    assert json.loads(told.stdout)["signed_by"] == "operator anna"
+    assert (parts / "v1" / "archives_seen.json").exists()
     told = run(map_group, ["verify", str(mirror), "--signatures", "--identity", identity, "--json"])
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout)["signed_by"] == {"operator anna": 31}
 
 
 def test_without_an_identity_nobody_looks_at_signatures_and_none_are_kept(
-    served: ServedFolder, store: SqliteStore, tmp_path: Path
+    served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path
 ) -> None:
-    publish(store, FolderObjects(served.folder), ["ndt"])
+    publish(store, FolderObjects(served.folder), ["ndt"], signing=Signing(parts / "anna"))
     with SqliteStore(tmp_path / "mirror.sqlite") as mirror:
         done = fetched(served, mirror, None)
         assert (done.fetched, done.unsigned) == (31, 31)
@@ -200,10 +222,12 @@ def test_without_an_identity_nobody_looks_at_signatures_and_none_are_kept(
         assert mirror.unsigned() == 31
 
 
-def test_a_store_with_reports_is_no_mirror(served: ServedFolder, store: SqliteStore, tmp_path: Path) -> None:
+def test_a_store_with_reports_is_no_mirror(
+    served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path
+) -> None:
     from store_helpers import report
 
-    publish(store, FolderObjects(served.folder), ["ndt"])
+    publish(store, FolderObjects(served.folder), ["ndt"], signing=Signing(parts / "anna"))
     with SqliteStore(tmp_path / "own.sqlite") as own:
         own.put_reports([report(1)])
         with pytest.raises(StoreError, match="is no mirror"):
@@ -213,7 +237,7 @@ def test_a_store_with_reports_is_no_mirror(served: ServedFolder, store: SqliteSt
 def test_a_vehicle_is_filled_from_the_archive(
     served: ServedFolder, store: SqliteStore, parts: Path, tmp_path: Path
 ) -> None:
-    publish(store, FolderObjects(served.folder), ["ndt"])
+    publish(store, FolderObjects(served.folder), ["ndt"], signing=Signing(parts / "anna"))
     cache: TileCache[Tile] = TileCache(tmp_path / "cache.sqlite", "ndt")
     check = VersionCheck(Publishers(parts / "v1"), "ndt", cache)  # the certificate comes from the archive, too
     with Archive(served.url) as archive:

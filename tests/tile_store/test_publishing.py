@@ -19,9 +19,11 @@ from gnd.schemas.archive import (
     UNSIGNED,
     ArchiveIndex,
     ArchiveRoot,
+    certificate_name,
     index_name,
     pack_name,
 )
+from gnd.schemas.archive_seal import Sealed, digest_of_index
 from gnd.schemas.tiles import TileReply, content_of
 from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.errors import StoreBusy, StoreError, StoreUnavailable
@@ -283,3 +285,98 @@ def test_signatures_are_published_and_new_ones_too(maker: Maker, objects: Folder
 def test_a_folder_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     with pytest.raises(StoreUnavailable, match="cannot open"):
         FolderObjects(tmp_path / "missing" / "archive")
+
+
+@pytest.fixture
+def anna(tmp_path: Path) -> Signing:
+    authority = Authority.create(tmp_path / "authority", "tests")
+    authority.issue(MemberName("operator", "anna"), tmp_path / "anna")
+    return Signing(tmp_path / "anna")
+
+
+def root_of(objects: NamedObjects) -> ArchiveRoot:
+    data = objects.get(ROOT_NAME)
+    assert data is not None
+    return ArchiveRoot.decode(data)
+
+
+def answers_for(anna: Signing, objects: NamedObjects, sealed: Sealed | None) -> bool:
+    assert sealed is not None
+    return anna.answers_for(sealed, objects.get(certificate_name(sealed.seal.signer)))
+
+
+def test_who_publishes_with_an_identity_signs_what_there_is(
+    maker: Maker, objects: FolderObjects, anna: Signing
+) -> None:
+    with maker.open() as store:
+        store.put_tiles([tile_of_voxels(tile, 1, 2) for tile in (TILE, FAR)])
+        assert publish(store, objects, ["ndt"], signing=anna).number == 1
+        root = root_of(objects)
+        assert answers_for(anna, objects, root.sealed)
+        for tile in (TILE, FAR):
+            index = index_of(objects, tile)
+            assert answers_for(anna, objects, index.sealed)
+            assert index.sealed is not None
+            assert root.digest("ndt", tile.district) == digest_of_index(index.sealed.body_sha)
+        again = publish(store, objects, ["ndt"], signing=anna)
+        assert (again.number, again.switched, again.objects) == (2, 0, 1), "the root says that it holds today, too"
+        assert root_of(objects).digests == root.digests
+        assert root.sealed is not None
+        now = root_of(objects).sealed
+        assert now is not None
+        assert (now.seal.archive, now.seal.order > root.sealed.seal.order) == (root.sealed.seal.archive, True)
+
+
+def test_an_archive_is_signed_later_and_stays_so(maker: Maker, objects: FolderObjects, anna: Signing) -> None:
+    with maker.open() as store:
+        store.put_tiles([tile_of_voxels(tile, 1, 2) for tile in (TILE, FAR)])
+        publish(store, objects, ["ndt"])
+        packs = names(objects, PACK_FOLDER)
+        part = publish(store, objects, ["ndt"], [TILE.district.path], signing=anna)
+        assert (part.switched, part.written) == (1, 0)
+        assert root_of(objects).districts == {"ndt": (TILE.district,)}, "nobody answers for the other one yet"
+        publish(store, objects, ["ndt"], signing=anna)
+        assert len(root_of(objects).districts["ndt"]) == 2
+        assert names(objects, PACK_FOLDER) == packs
+        before = {name: objects.get(name) for name in names(objects)}
+        with pytest.raises(StoreError, match="the archive is signed; publish with the identity"):
+            publish(store, objects, ["ndt"])
+        assert {name: objects.get(name) for name in names(objects)} == before
+
+
+def test_what_somebody_else_has_put_into_the_archive_is_signed_by_nobody(
+    maker: Maker, objects: FolderObjects, anna: Signing
+) -> None:
+    """An index that was altered, or a root: what the store says is published anew."""
+    with maker.open() as store:
+        store.put_tiles([tile_of_voxels(tile, 1, 2) for tile in (TILE, FAR)])
+        publish(store, objects, ["ndt"], signing=anna)
+        good, name = index_of(objects), index_name("ndt", TILE.district)
+        objects.put(name, ArchiveIndex("ndt", TILE.district).encode())
+        objects.put(ROOT_NAME, ArchiveRoot({"ndt": (TILE.district,)}, {"ndt": (bytes(16),)}).encode())
+        done = publish(store, objects, ["ndt"], signing=anna)
+        assert done.switched == 1
+        assert {e.tile: e.version for e in index_of(objects).entries} == {e.tile: e.version for e in good.entries}
+        root = root_of(objects)
+        assert answers_for(anna, objects, root.sealed)
+        for tile in (TILE, FAR):
+            sealed = index_of(objects, tile).sealed
+            assert sealed is not None
+            assert root.digest("ndt", tile.district) == digest_of_index(sealed.body_sha)
+
+
+def test_who_is_interrupted_leaves_an_archive_that_is_signed(
+    maker: Maker, objects: FolderObjects, anna: Signing
+) -> None:
+    """Each object is whole and signed at any time; an index may be newer than the root."""
+    with maker.open() as store:
+        store.put_tiles([tile_of_voxels(tile, 1, 2) for tile in (TILE, FAR)])
+        publish(store, objects, ["ndt"], signing=anna)
+        store.put_tiles([tile_of_voxels(tile, 1, 2, 3) for tile in (TILE, FAR)])
+        for at in (0, 1, 2, 2):  # before the first pack, its index, the second pack, the root
+            with pytest.raises(Killed):
+                publish(store, KilledObjects(objects, at), ["ndt"], signing=anna)  # type: ignore[arg-type]
+            parts = root_of(objects).sealed, *(index_of(objects, tile).sealed for tile in (TILE, FAR))
+            assert all(answers_for(anna, objects, one) for one in parts)
+        publish(store, objects, ["ndt"], signing=anna)
+        assert {index_of(objects, tile).by_tile[tile].version for tile in (TILE, FAR)} == {2}
