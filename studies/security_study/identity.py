@@ -3,12 +3,8 @@
 import concurrent.futures
 import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +24,7 @@ from gnd.fleet_bus.identity.lists import MemberList, replace_file
 from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.links import load_link
 from studies.security_study.delay_relay import DelayRelay
+from studies.security_study.kilometre import kilometres, router
 from studies.security_study.light_clients import Opening, cpu_of_s, open_sessions, record_opening
 
 CONNECTS: Final = 20
@@ -38,18 +35,6 @@ EXCHANGES: Final = 200
 PAYLOAD: Final = bytes(200)
 """Of a question and of its answer: about what a steady vehicle sends in a message."""
 ROUNDS: Final = 3
-_QUESTIONS: Final = ((70, 13), (46, 6), (42, 6), (66, 9), (35, 5), (34, 5), (36, 5), (33, 5), (39, 5))
-_REPORTS: Final = ((178, 28), (70, 24), (198, 28), (92, 24))
-KILOMETRE: Final = (
-    *(("tile", up, down) for up, down in _QUESTIONS),
-    *(("report", up, down) for up, down in _REPORTS),
-    *(("telemetry", up, 0) for up in (62, 144)),
-)
-"""What a vehicle says and hears on a known street, payload bytes up and down, as the ledger of `gnd reproduce
-steady-vehicle --length 1000` (seed 201) has it, without what it asks again because a busy machine takes minutes for it.
-A report has an ack of `ACK_BYTES` besides; down is the word on it."""
-ACK_BYTES: Final = 32
-PAUSE_S: Final = 0.3
 KILOMETRES: Final = 3
 TILE: Final = "gnd/v1/tile/ndt/13033/03021/21000/00000"
 
@@ -73,10 +58,10 @@ def identity(members: str, to: Path | None) -> None:
 
 def _costs(identities: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    with _router("tcp", identities) as (port, _):
+    with router("tcp", identities) as (port, _):
         opening = record_opening(port)
     for protocol in ("tcp", "tls"):
-        with _router(protocol, identities) as (port, process):
+        with router(protocol, identities) as (port, process):
             endpoint = f"{protocol}/127.0.0.1:{port}"
             config = BusConfig(connect=(endpoint,), identity=identities / "vehicle-00")
             with DelayRelay(port, load_link("3g")) as relay:
@@ -90,64 +75,9 @@ def _costs(identities: Path) -> dict[str, Any]:
             found[protocol]["light_clients"] = _light_sessions(opening, port, tls, process)
             found[protocol]["zenoh_clients"] = _sessions(config, process)
             for drive in ("first_drive", "next_drive"):  # the next one knows the certificates
-                found[protocol][drive] = _kilometres(endpoint, identities if tls else None)
+                found[protocol][drive] = kilometres(endpoint, identities if tls else None, KILOMETRES)
             found[protocol] |= _bytes(config, BusConfig(connect=(endpoint,), identity=identities / "store"))
     return found
-
-
-def _kilometres(endpoint: str, identities: Path | None) -> dict[str, float]:
-    """IP bytes of the messages of `KILOMETRE`: the first time on a connection, and again."""
-    configs = {
-        name: BusConfig(connect=(endpoint,), link="4g", identity=None if identities is None else identities / name)
-        for name in ("store", "merger-0", "vehicle-00")
-    }
-    with (
-        open_bus(configs["store"]) as store,
-        open_bus(configs["merger-0"]) as shard,
-        open_bus(configs["vehicle-00"]) as vehicle,
-    ):
-        store.serve("gnd/v1/tiles/**", lambda request: bytes(int(request.payload[0])), complete=True, kind="tile")
-        shard.serve("gnd/v1/change/**", lambda _request: bytes(ACK_BYTES), complete=True, kind="change")
-        vehicle.subscribe("gnd/v1/want/vehicle-00", lambda _key, _payload: None, kind="ack")
-        total = [0]
-        for _ in range(1 + KILOMETRES):
-            for what, up, down in KILOMETRE:
-                _say(vehicle, shard, what, bytes([down]) + bytes(up - 1))
-                time.sleep(PAUSE_S)
-            wire = vehicle.wire()
-            total.append(wire.up + wire.down)
-    driven = np.diff(total)
-    return {
-        "first_kilometre_bytes": float(driven[0]),
-        "kilometre_bytes_mean": float(driven[1:].mean()),
-        "kilometre_bytes_max": float(driven[1:].max()),
-    }
-
-
-def _say(vehicle: Bus, shard: Bus, what: str, payload: bytes) -> None:
-    if what == "tile":
-        vehicle.request("gnd/v1/tiles/ndt/13033/03021/21000", payload, kind="tile", timeout_s=20)
-    elif what == "report":
-        vehicle.request("gnd/v1/change/ndt/13033/03021/21000", payload, kind="change", timeout_s=20)
-        time.sleep(PAUSE_S)
-        shard.publish("gnd/v1/want/vehicle-00", bytes(payload[0]), kind="ack")
-    else:
-        vehicle.publish("gnd/v1/traffic/vehicle-00", payload, kind="telemetry")
-
-
-@contextmanager
-def _router(protocol: str, identities: Path) -> Iterator[tuple[int, int]]:
-    """A router process: its port and its id."""
-    port = claim_port(0)
-    command = [sys.executable, "-m", "gnd.deploy.cli", "router", "--listen", f"{protocol}/127.0.0.1:{port}"]
-    command += ["--identity", str(identities / "router")] if protocol == "tls" else []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603 - our own command
-        try:
-            assert process.stdout is not None
-            process.stdout.readline()
-            yield port, process.pid
-        finally:
-            process.terminate()
 
 
 def _connect_s(config: BusConfig) -> float:

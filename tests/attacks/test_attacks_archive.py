@@ -140,8 +140,8 @@ def test_an_old_version_under_a_new_number_is_refused(scene: ArchiveScene) -> No
 
 
 def forged(scene: ArchiveScene, signer: str | None) -> FetchedArchive:
-    """An archive of another world, version 3, its tiles signed by who may not, or by nobody; index and root are signed by
-    an operator who was deceived.
+    """An archive of another world, version 3, its tiles signed by who may not, or by nobody; index and root are signed
+    by an operator who was deceived.
     """
     objects = FolderObjects(scene.folder / "forged")
     signing = None if signer is None else Signing(scene.parts[signer])

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from gnd.deploy.fleet_identities import make_identities
-from studies.security_study.identity import _router
+from studies.security_study.kilometre import router
 from studies.security_study.light_clients import _open, _tls_context, cpu_of_s, open_sessions, record_opening
 
 
 def test_a_router_accepts_light_clients(tmp_path: Path) -> None:
     identities = make_identities(tmp_path, 1, 1)
-    with _router("tcp", identities) as (plain, _), _router("tls", identities) as (port, process):
+    with router("tcp", identities) as (plain, _), router("tls", identities) as (port, process):
         opening = record_opening(plain)
         found = open_sessions(opening, port, identities / "vehicle-00", 6)
         assert found.sessions == 6
