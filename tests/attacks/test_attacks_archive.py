@@ -285,7 +285,9 @@ def test_what_came_before_it_failed_is_kept(scene: ArchiveScene, hurried: None) 
 
 
 def test_attack_a_mirror_goes_back_to_an_older_state(scene: ArchiveScene, tmp_path: Path) -> None:
-    """It is noticed by who has seen the newer one, also after a new start, and named before a tile is looked at."""
+    """A mirror goes back to an older state of the archive; who has seen the newer one refuses it by name, also after a
+    new start, before a tile is looked at.
+    """
     kept = tmp_path / "archives_seen.json"
     scene.seen = SeenStates(kept)
     scene.fetch()
@@ -299,6 +301,7 @@ def test_attack_a_mirror_goes_back_to_an_older_state(scene: ArchiveScene, tmp_pa
 
 
 def test_attack_an_old_index_under_the_root_of_now(scene: ArchiveScene) -> None:
+    """A mirror keeps one district at an older state under the root of now; the root names another index."""
     old = scene.old.get(INDEX)
     assert old is not None
     time.sleep(1.1)
@@ -319,6 +322,7 @@ def test_a_publisher_at_work_is_no_attack(scene: ArchiveScene) -> None:
 
 
 def test_attack_an_index_is_withheld(scene: ArchiveScene) -> None:
+    """A mirror says that a district's index is not there; the root names it, so this is told."""
     scene.mirror.wrong["index/"] = lambda handler, _data: handler.whole(b"", status=404)
     with pytest.raises(ArchiveAway, match=r"not there, though the root names it: withheld"):
         scene.fetch()
@@ -327,6 +331,7 @@ def test_attack_an_index_is_withheld(scene: ArchiveScene) -> None:
 @pytest.mark.parametrize("where", ["archive.gnd", "index/"])
 @pytest.mark.parametrize("what", ["left out", "unsigned", "more behind", "more between", "seal cut", "bit", "number"])
 def test_attack_altered_by_the_mirror(scene: ArchiveScene, where: str, what: str) -> None:
+    """A mirror leaves tiles or districts out, takes the seal off, adds bytes to it, or alters its number."""
     name = ROOT_NAME if where == "archive.gnd" else INDEX
     data = scene.new.get(name)
     assert data is not None
@@ -353,7 +358,7 @@ def test_attack_altered_by_the_mirror(scene: ArchiveScene, where: str, what: str
 
 
 def test_attack_the_seal_of_an_index_under_a_root(scene: ArchiveScene) -> None:
-    """A seal says what it is of: one over the same bytes as another kind of object is none."""
+    """A true seal over the same bytes, made for an index, is put under the root; a seal says what it is of."""
     root = ArchiveRoot.decode(scene.new.get(ROOT_NAME) or b"")
     assert root.sealed is not None
     seal, _ = Signing(scene.parts["operator"]).seal("index", root.encode(), root.sealed.seal.archive, root.sealed.seal)
@@ -364,6 +369,7 @@ def test_attack_the_seal_of_an_index_under_a_root(scene: ArchiveScene) -> None:
 
 
 def test_attack_a_publisher_of_another_authority_signs_the_archive(scene: ArchiveScene) -> None:
+    """A mirror signs all of the archive as an operator of an authority of its own, and shows that certificate."""
     scene.put_index(scene.new, scene.index(scene.new), "foreign")
     chain = Signing(scene.parts["foreign"]).seal("root", b"x", bytes(8), None)
     scene.new.put(certificate_name(chain[0].signer), chain[1])
@@ -372,6 +378,7 @@ def test_attack_a_publisher_of_another_authority_signs_the_archive(scene: Archiv
 
 
 def test_attack_a_revoked_publisher_signs_the_archive(scene: ArchiveScene, tmp_path: Path) -> None:
+    """The operator who has signed the archive is revoked: no part of it counts any more."""
     authority = Authority(tmp_path / "own")
     operator, vehicle = authority.part("operator", "o"), authority.part("vehicle", "v")
     objects = FolderObjects(tmp_path / "own-archive")
