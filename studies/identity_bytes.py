@@ -10,7 +10,7 @@ import numpy as np
 
 from gnd.deploy.fleet_identities import make_identities
 from studies.frame.measure import Figure
-from studies.security_study.kilometre import KILOMETRE, KILOMETRE_BEFORE, Said, router, wired
+from studies.security_study.kilometre import KILOMETRE, KILOMETRE_BEFORE, KilometreMessage, router, wired
 
 TIMES: Final = 20
 _WAYS: Final = (("plain", "tcp", False), ("seals", "tcp", True), ("seals and TLS", "tls", True))
@@ -28,7 +28,7 @@ class _Cost:
 
     of: dict[str, float]
 
-    def kilometre(self, said: tuple[Said, ...]) -> float:
+    def kilometre(self, said: tuple[KilometreMessage, ...]) -> float:
         """IP bytes of these messages; payloads are those of each, all else is the mean."""
         return sum(self.of[one.what] + one.up + one.down for one in said)
 

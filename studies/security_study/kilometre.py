@@ -19,7 +19,7 @@ What = Literal["question", "report", "word", "telemetry"]
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class KilometreMessage:
     """A message of the vehicle, or a word to it, and what comes back.
 
     Attributes:
@@ -36,18 +36,24 @@ class Said:
 ACK_BYTES: Final = 32
 _REPORTS: Final = ((183, 28), (80, 24), (195, 28), (91, 24))
 _WITH_REPORTS: Final = tuple(
-    one for up, down in _REPORTS for one in (Said("report", up, ACK_BYTES), Said("word", 0, down))
+    one
+    for up, down in _REPORTS
+    for one in (KilometreMessage("report", up, ACK_BYTES), KilometreMessage("word", 0, down))
 )
-_TELEMETRY: Final = (Said("telemetry", 62, 0), Said("telemetry", 159, 0))
+_TELEMETRY: Final = (KilometreMessage("telemetry", 62, 0), KilometreMessage("telemetry", 159, 0))
 KILOMETRE: Final = (
-    *(Said("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6))),
+    *(KilometreMessage("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6))),
     *_WITH_REPORTS,
     *_TELEMETRY,
 )
 """Payload bytes as the ledger of `gnd reproduce steady-vehicle --length 1000 --pace 2` (seed 201) has them, without the
 report that the end of the drive makes."""
 _ASKED_BEFORE: Final = ((70, 13), (46, 6), (42, 6), (66, 9), (35, 5), (34, 5), (36, 5), (33, 5), (39, 5))
-KILOMETRE_BEFORE: Final = (*(Said("question", up, down) for up, down in _ASKED_BEFORE), *_WITH_REPORTS, *_TELEMETRY)
+KILOMETRE_BEFORE: Final = (
+    *(KilometreMessage("question", up, down) for up, down in _ASKED_BEFORE),
+    *_WITH_REPORTS,
+    *_TELEMETRY,
+)
 """The same where tiles on no map were asked about one by one, before decision 167."""
 PAUSE_S: Final = 0.3
 _ASKED: Final = "gnd/v1/tiles/ndt/13033/03021/21000"
@@ -62,7 +68,7 @@ class Wired:
     vehicle: Bus
     shard: Bus
 
-    def say(self, one: Said) -> None:
+    def say(self, one: KilometreMessage) -> None:
         """One message, with what comes back; its packets have passed when this returns."""
         if one.what == "question":
             self.vehicle.request(_ASKED, one.down.to_bytes(2, "big") + bytes(one.up - 2), kind="tile", timeout_s=20)
@@ -74,7 +80,7 @@ class Wired:
             self.vehicle.publish("gnd/v1/traffic/vehicle-00", bytes(one.up), kind="telemetry")
         time.sleep(PAUSE_S)
 
-    def bytes_of(self, said: tuple[Said, ...]) -> int:
+    def bytes_of(self, said: tuple[KilometreMessage, ...]) -> int:
         """IP bytes in both directions."""
         before = self.vehicle.wire()
         for one in said:

@@ -46,7 +46,7 @@ _SELDOM: Final = Seldom(_log)
 
 
 @dataclass(frozen=True, slots=True)
-class _Question:
+class _TilesQuestion:
     """What is asked at once, of one district.
 
     Attributes:
@@ -251,7 +251,7 @@ class TileFetcher(Generic[TileT]):
                 self._on_a_map.update(set(question.besides).intersection(outcome.later))
                 self._line_up()
 
-    def _next(self) -> _Question | None:
+    def _next(self) -> _TilesQuestion | None:
         """The next question: the first tile that may be asked for now, and more of its district; None when closed."""
         with self._changed:
             while not self._closed:
@@ -267,13 +267,13 @@ class TileFetcher(Generic[TileT]):
                 self._changed.wait(POLL_S)
             return None
 
-    def _question(self, batch: dict[TileId, float]) -> _Question:
+    def _question(self, batch: dict[TileId, float]) -> _TilesQuestion:
         """A question about tiles that wait, given with the bytes expected. The lock is held."""
         district = next(iter(batch)).district
         done = (self._answered - self._stale) | self._in_flight.keys() | self._on_a_map
         besides = tuple(t for t in self._besides if t.district == district and t not in done)[: MOST_TILES - len(batch)]
         expected_bytes = max(LEAST_BESIDES_BYTES, round(sum(batch.values())))
-        return _Question(
+        return _TilesQuestion(
             tuple(batch), besides, min(self._batch_bytes, expected_bytes) if besides else self._batch_bytes
         )
 
@@ -287,7 +287,7 @@ class TileFetcher(Generic[TileT]):
             batch[tile_id] = expected_bytes
         return batch
 
-    def _try(self, question: _Question) -> ExchangeOutcome[TileT]:
+    def _try(self, question: _TilesQuestion) -> ExchangeOutcome[TileT]:
         batch, asked = question.tiles, (*question.tiles, *question.besides)
         with self._changed:
             whole = {tile_id for tile_id in asked if self._wrong[tile_id]}

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gnd.deploy.fleet_identities import make_identities
-from studies.security_study.kilometre import KILOMETRE, Said, router, wired
+from studies.security_study.kilometre import KILOMETRE, KilometreMessage, router, wired
 
 pytestmark = pytest.mark.slow
 
@@ -19,7 +19,7 @@ def test_each_message_passes_the_vehicle_s_connection(tmp_path: Path, protocol: 
     ):
         parts.bytes_of((KILOMETRE[0], KILOMETRE[3]))
         for what in ("question", "report", "word", "telemetry"):
-            small, large = (parts.bytes_of((Said(what, 200, 100 * n),)) for n in (1, 9))
+            small, large = (parts.bytes_of((KilometreMessage(what, 200, 100 * n),)) for n in (1, 9))
             assert small > 200 * (what != "word") + 52
             if what in ("question", "word"):
                 assert 700 < large - small < 1100
