@@ -25,6 +25,8 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.region import parse_region
 from gnd.gnd_map.tile import Tile
 from gnd.schemas import keys
+from gnd.schemas.archive import ArchiveIndex, ArchiveRoot
+from gnd.schemas.archive_seal import ArchiveSeal, with_seal
 from gnd.schemas.drive import (
     Detections,
     DriveHeader,
@@ -55,6 +57,7 @@ from gnd.schemas.generated import (
     traffic_sample_pb2,
     version_signatures_pb2,
 )
+from gnd.schemas.limits import MAX_ARCHIVE_INDEX_BYTES, MAX_ARCHIVE_ROOT_BYTES
 from gnd.schemas.packed import decode_upload
 from gnd.schemas.report_id import check_report_id, report_id_of_bytes
 from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
@@ -159,6 +162,13 @@ def _more_seeds(name: str) -> list[bytes]:
     if name == "TileUpdate":
         coded = encode_content_delta(HELD, after)
         return [TileUpdate(TILE, "ndt", 4, 3, after.sha, HELD.sha, "merged", coded_delta=coded, put_voxels=2).encode()]
+    seal = ArchiveSeal(bytes(8), 3, 1_795_780_247, bytes(8), bytes(64))
+    if name == "ArchiveIndex":
+        indexes = [one.encode() for one in GOLDEN.values() if isinstance(one, ArchiveIndex)]
+        return [with_seal("index", body, seal, MAX_ARCHIVE_INDEX_BYTES) for body in indexes]
+    if name == "ArchiveRoot":
+        roots = [one.encode() for one in GOLDEN.values() if isinstance(one, ArchiveRoot)]
+        return [with_seal("root", body, seal, MAX_ARCHIVE_ROOT_BYTES) for body in roots]
     return []
 
 
