@@ -167,7 +167,7 @@ class Surroundings:
 
     def _of_known_districts(self) -> tuple[TileId, ...]:
         """All tiles of the plan's districts, where the cache holds much of the plan: most are on no map, and to hear so
-        of a whole district costs some 20 B more than of the tiles ahead, which change with the heading.
+        of a whole district costs a few bytes more than of the tiles ahead, which change with the heading.
         """
         if sum(map(self._fetcher.is_held, self.wanted)) < KNOWN_SHARE * len(self.wanted):
             return ()

@@ -37,6 +37,7 @@ def test_who_knows_no_seals_reads_the_same() -> None:
     assert message.SerializeToString(deterministic=True) == BODY
     assert ArchiveIndex.decode(SEALED) == ArchiveIndex.decode(BODY)
     assert ArchiveIndex.decode(BODY).sealed is None
+    assert 95 <= len(SEALED) - len(BODY) <= 105
 
 
 @given(st.integers(0, len(SEALED) - 1), st.integers(1, 255))
