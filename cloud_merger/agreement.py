@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gnd.cloud_merger.caps import CAP_OWNER_NAMES
 from gnd.cloud_merger.hearing import Hearing, Said, Spoken, passing
-from gnd.cloud_merger.statements import Report, Statements
+from gnd.cloud_merger.statements import Report, Statements, is_met
 from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.tile_store.values import AgreementTest
@@ -50,7 +50,7 @@ class Agreement:
         tests: of each report that others can judge.
         contradicted: the vehicles that are not believed alone in this tile.
         denied: of each vehicle its claims that somebody else has seen, too, and how many of them more deny than say the
-            same.
+            same; a vote by what it met counts as a claim here.
     """
 
     tests: tuple[AgreementTest, ...] = ()
@@ -58,7 +58,9 @@ class Agreement:
     denied: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
-def agreement_of(epoch: Gaussians, statements: Statements, spoken: Spoken, found: Hearing) -> Agreement:
+def agreement_of(
+    epoch: Gaussians, statements: Statements, spoken: Spoken, found: Hearing, judges_met: bool = True
+) -> Agreement:
     """How the reports of a window agree.
 
     Args:
@@ -66,6 +68,9 @@ def agreement_of(epoch: Gaussians, statements: Statements, spoken: Spoken, found
         statements: of all reports of the window, believed or not.
         spoken: what they say.
         found: who is heard; the others are judged and judge nobody.
+        judges_met: whether votes by what vehicles met can be denied; they could not by the rules of before.
+
+    Nobody is refuted for such a vote, for others decide, too, whether there is one.
     """
     reports = statements.reports
     if len(spoken.names) < 2 or not len(spoken.at):
@@ -79,7 +84,13 @@ def agreement_of(epoch: Gaussians, statements: Statements, spoken: Spoken, found
         _voices_around(told, which & heard) for which in (gone, there, same)
     )
     agree = np.where(gone, gone_before + gone_after, there_before + there_after)
-    n_judged, n_denied = _denied(len(reports), told.report, claim, agree, same_before + same_after)
+    met = is_met(statements.rows[told.at]) & judges_met
+    met_before, met_after = _voices_around(told, met & heard) if met.any() else (0, 0)
+    is_spoken_of = there_before + there_after + same_before + same_after > 0  # not only by those who met something, too
+    say_so = np.where(met, agree + met_before + met_after, agree)
+    n_judged, n_denied = _denied(
+        len(reports), told.report, claim | (met & is_spoken_of), say_so, same_before + same_after
+    )
     # what the tile holds now was claimed rightly against an older version
     settled = np.bincount(told.report[(told.restated != Said.OPEN) & (same_before + same_after > 0)])
     n_settled = np.pad(settled, (0, len(reports) - len(settled)))

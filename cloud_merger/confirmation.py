@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.merge import MergedTile
-from gnd.cloud_merger.statements import REMEMBERED, Report, Witness
+from gnd.cloud_merger.statements import REMEMBERED, Report, Statements, Witness, is_met
 from gnd.gnd_map.arrays import I32, I64, are_in, unique
 from gnd.gnd_map.beside import group_numbers
 from gnd.gnd_map.by_object import ByObject
@@ -116,6 +116,7 @@ def gate(
     contradicted: frozenset[str] = frozenset(),
     over_cap: frozenset[tuple[str, int]] = frozenset(),
     first_of: Mapping[str, str] = _NO_GROUPS,
+    vouching: Mapping[int, tuple[str, ...]] | None = None,
 ) -> GatedTile:
     """Take back the changes that wait for confirmation.
 
@@ -135,11 +136,12 @@ def gate(
             little it is.
         over_cap: vehicles, and days of receipt on which they have changed as much alone as one may.
         first_of: of vehicles that say the same false things who stands for all of them: they are one witness.
+        vouching: of `vouching_for`; None: all reports of the cluster that won vouch for a change.
     """
     parameters = parameters or ConfirmationParameters()
     by_report = {report.report_id: report for report in reports}
     by_id = {witness.report_id: witness for witness in witnesses} | by_report
-    lonely, shared = _witnesses(merged, by_id, named, first_of)
+    lonely, shared = _witnesses(merged.provenance if vouching is None else vouching, by_id, named, first_of)
     shared = shared if len(epoch) else {}  # new ground is nobody's loss
     if not lonely:
         return GatedTile(merged, shared=shared)
@@ -173,8 +175,31 @@ def _beyond_the_day(
     return {voxel: "day" for voxel, reports in rest if {one.received_ns // _NS_PER_DAY for one in reports} <= days}
 
 
+def vouching_for(merged: MergedTile, statements: Statements) -> Mapping[int, tuple[str, ...]]:
+    """Of each change the reports that vouch for it: those that claim it. Where it is new by what several met and none
+    decides upon, all of them are one witness, told by the first report: nobody answers for such a vote, so any two that
+    lie together could publish as much as they like.
+    """
+    rows = statements.rows[merged.for_change] if len(merged.for_change) else statements.rows[:0]
+    rows = rows[rows["report"] >= 0]
+    met = is_met(rows)
+    rows = rows[are_in(rows["voxel_id"], np.intersect1d(rows["voxel_id"][met], merged.changed))]
+    if not len(rows):
+        return merged.provenance
+    ids, found = statements.report_ids, dict(merged.provenance)
+    voxels, begin = np.unique(rows["voxel_id"], return_index=True)
+    for voxel, own in zip(voxels.tolist(), np.split(rows, begin[1:]), strict=True):
+        claims = own["report"][~is_met(own)].tolist()
+        first = min(ids[number] for number in own["report"].tolist())
+        found[voxel] = tuple(dict.fromkeys(ids[number] for number in claims)) or (first,)
+    return found
+
+
 def _witnesses(
-    merged: MergedTile, by_id: Mapping[str, Who], named: frozenset[str], first_of: Mapping[str, str]
+    provenance: Mapping[int, tuple[str, ...]],
+    by_id: Mapping[str, Who],
+    named: frozenset[str],
+    first_of: Mapping[str, str],
 ) -> tuple[dict[str, _Witness], Mapping[str, int]]:
     """By vehicle, its part in the changes that won, of those that claim any alone; and what each claims with others.
     Named vehicles do not confirm each other either, nor do those of a group.
@@ -184,7 +209,7 @@ def _witnesses(
     lonely: dict[str, dict[int, tuple[Who, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
     voxels: dict[tuple[str, ...], list[int]] = defaultdict(list)
-    for voxel, ids in merged.provenance.items():
+    for voxel, ids in provenance.items():
         voxels[ids].append(voxel)
     for ids, told in voxels.items():
         vehicles = {by_id[one].vehicle for one in ids}

@@ -200,7 +200,7 @@ class Expander:
         asked = {tile for tile, ids in asked_voxels(report, first.mask).items() if len(ids)}
         rows = tuple(
             replace(row, is_half=row.tile in asked, is_quiet=row.is_quiet or row.tile in first.hopeless)
-            for row in rows_of(report, claim.upload.received_ns)
+            for row in self._rows_of(report, claim)
         )
         if not first.wanted:
             return self._released(claim, rows, self._place_of(report))
@@ -234,7 +234,7 @@ class Expander:
             reason = one_line(f"{type(error).__name__}: {error}")
             settled = Settled(claim, "quarantined", reason=reason, first=Answered(half.number, "resend", reason))
             return _Outcome(settled, half.vehicle, ReportState(gaussians.report_id, "resend", reason=reason))
-        rows = tuple(row for part in parts for row in rows_of(part, claim.upload.received_ns, part=1))
+        rows = tuple(row for part in parts for row in self._rows_of(part, claim, part=1))
         settled = Settled(claim, "released", rows, first=Answered(half.number, "released"))
         return _Outcome(settled, half.vehicle, ReportState(gaussians.report_id, "released"))
 
@@ -243,9 +243,12 @@ class Expander:
         halves = self._store.first_halves(claim.upload.key, report.report_id)
         flags = [half for half in halves if half.journal_id and half.vehicle == report.vehicle]
         if not flags:
-            return rows_of(report, claim.upload.received_ns)
+            return self._rows_of(report, claim)
         renamed = replace(report, report_id=flags[0].journal_id)
-        return rows_of(renamed, claim.upload.received_ns, part=1)
+        return self._rows_of(renamed, claim, part=1)
+
+    def _rows_of(self, report: ChangeReport, claim: UploadClaim, part: int = 0) -> tuple[ReportRow, ...]:
+        return rows_of(report, claim.upload.received_ns, part, together=self._config.merge.together)
 
     def _renamed(self, outcome: _Outcome, taken: IdTaken) -> _Outcome:
         """Another vehicle has this report id: the journal keeps this report under one of its own."""
@@ -278,12 +281,15 @@ class Expander:
         return _Outcome(settled, upload.vehicle, told, asks)
 
 
-def rows_of(report: ChangeReport, received_ns: int, part: int = 0) -> tuple[ReportRow, ...]:
-    """A report as the journal keeps it: one row a tile."""
+def rows_of(
+    report: ChangeReport, received_ns: int, part: int = 0, *, together: bool = False
+) -> tuple[ReportRow, ...]:
+    """A report as the journal keeps it: one row a tile. `together`: what it does not decide upon is to be merged, too.
+    """
     return tuple(
         ReportRow(
             report.report_id, report.layer, tile, report.vehicle, received_ns, body, change.base_sha, part,
-            is_quiet=not len(change.changed) and not len(change.unsure),
+            is_quiet=not len(change.changed) and not (together and len(change.unsure)),
         )
         for change, (tile, body) in zip(report.tiles, encoded_parts(report), strict=True)
     )  # fmt: skip

@@ -15,7 +15,7 @@ from gnd.cloud_merger.window import TileState
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
 from gnd.tile_store.store import Store
-from gnd.tile_store.values import JournalMark, ReportRow
+from gnd.tile_store.values import JournalMark, ReportRow, TileJournal
 
 REMEMBERED_TILES: Final = 256  # some 400 kB each where a window is full
 
@@ -64,7 +64,7 @@ class TilesInPlay:
         if found is None:
             journal = self._store.in_play(layer, tile)
             votes = TileVotes.of(self._reports(journal.reports))
-            found = TileInPlay(journal.mark, self._bases.state(tile, journal), votes)
+            found = TileInPlay(journal.mark, self._state(tile, journal), votes)
         with self._lock:
             self._held[layer, tile] = found
             self._held.move_to_end((layer, tile))
@@ -78,6 +78,10 @@ class TilesInPlay:
             return None
         mark, rows = since
         return TileInPlay(mark, held.state, held.votes.with_reports(self._reports(rows)))
+
+    def _state(self, tile: TileId, journal: TileJournal) -> TileState:
+        state = self._bases.state(tile, journal)
+        return state if self._merge.together else TileState(state.gaussians, state.memory.without_met())
 
     def _reports(self, rows: Iterable[ReportRow]) -> list[Report]:
         """What stored reports say; not those that can no longer be read, of which the merge will tell."""

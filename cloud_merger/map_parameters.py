@@ -145,6 +145,13 @@ def has_hearing(text: str) -> bool:
     return bool(text) and "hearing" in json_value(text)
 
 
+def judges_met(text: str) -> bool:
+    """Whether a text is of rules by which what several met and none decides upon is one witness's word, and denied as
+    claims are. "" and older texts are of rules that added it up, whoever told of it, and judged nobody by it.
+    """
+    return bool(text) and "together" in json_value(text)["merge"]
+
+
 def digest_of(text: str) -> str:
     """What a text is told from others by: its SHA-256 in hex."""
     return sha256(text.encode()).hexdigest()
@@ -163,6 +170,7 @@ def with_text(config: ShardConfig, text: str) -> ShardConfig:
         if said["format"] != _FORMAT:
             raise MergerError(f"parameters of format {said['format']}, this release reads {_FORMAT}")
         said["confirmation"].setdefault("parked_h", 0.0)  # made when nothing was held back for its shape
+        said["merge"].setdefault("together", True)  # made when what vehicles met was always added up
         _take_constants(said)
         groups = {name: from_mapping(kind, said[name], where=name) for name, kind in _GROUPS.items()}
         declared = tuple(from_mapping(LayerParameters, table) for table in said.get("feature_layer", ()))

@@ -14,7 +14,7 @@ Nothing here grows with the number of reports.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 from zlib import crc32
 
@@ -23,7 +23,18 @@ import zstandard
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.errors import MergerError
-from gnd.cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, Rows, Witness, find, stacked, states_at
+from gnd.cloud_merger.statements import (
+    EPOCH,
+    STATEMENT,
+    Kind,
+    Report,
+    Rows,
+    Witness,
+    find,
+    is_met,
+    stacked,
+    states_at,
+)
 from gnd.gnd_map.bounded import json_value, zstd_unpacked
 from gnd.gnd_map.gaussian import Gaussians
 
@@ -133,6 +144,11 @@ class TileMemory:
                 stays[at[~newest] if all(map(self.is_fresh, speaks)) else at] = False
         kept: Rows = self.claims[stays]
         return kept
+
+    def without_met(self) -> "TileMemory":
+        """The same without votes by what vehicles met and did not decide upon."""
+        met = is_met(self.claims)
+        return replace(self, claims=self.claims[~met]) if met.any() else self
 
     def encode(self) -> bytes:
         """Bytes for the store: a head in JSON, the columns of voxels, the claims; zstd."""

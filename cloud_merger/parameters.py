@@ -48,6 +48,11 @@ class MergeParameters:
         least=0,
         below=1,
     )
+    together: bool = setting(
+        False,
+        "Whether what vehicles met and did not decide upon is added up; vehicles tell of it with `detect.together`. "
+        "Off: it counts for nothing.",
+    )
     poses: bool = setting(True, "Whether what the reports tell of their poses counts at all.")
     pose_weight_m: float = setting(
         0.1,

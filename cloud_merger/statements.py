@@ -6,7 +6,7 @@ rebased, not lost.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -196,6 +196,18 @@ def _met(epoch: Gaussians, reports: Sequence[Report]) -> Rows:
     return rows
 
 
+_DECIDED: Final[ByObject[TileChange]] = ByObject(REMEMBERED)
+
+
+def without_unsure(reports: Iterable[Report]) -> tuple[Report, ...]:
+    """The reports without what their vehicles met and did not decide upon: of such voxels they say nothing."""
+    return tuple(replace(one, change=_decided(one.change)) if len(one.change.unsure) else one for one in reports)
+
+
+def _decided(change: TileChange) -> TileChange:
+    return _DECIDED.of(change, lambda: replace(change, unsure=Gaussians.empty()))
+
+
 def _called_new(report: Report) -> NDArray[np.int32]:
     told = changed_of(report.change)
     there = told.speaks & (told.rows["kind"] != Kind.NOTHING) & (report.change.change_class == ChangeClass.NEW)
@@ -212,7 +224,7 @@ def _with(met: Rows, rows: Rows) -> Rows:
 
 
 def is_met(rows: Rows) -> NDArray[np.bool_]:
-    """(M,) which statements of a window's reports are about what no vehicle decides upon alone."""
+    """(M,) which statements, remembered ones, too, are about what no vehicle decides upon alone."""
     return np.asarray((rows["kind"] == Kind.MEASURED) & ~rows["claim"])
 
 

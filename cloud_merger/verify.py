@@ -9,7 +9,7 @@ from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.kept import FeatureContents
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, refuted_of, windows_of
-from gnd.cloud_merger.map_parameters import digest_of, has_hearing, text_of, with_text
+from gnd.cloud_merger.map_parameters import digest_of, has_hearing, judges_met, text_of, with_text
 from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.statements import Report
 from gnd.cloud_merger.stored import Bases, lattice_of_tile, reports_by_window
@@ -216,9 +216,15 @@ class Verifier:
         def merged(window: int, reports: Sequence[Report]) -> MergedWindow:
             how = journal.how(window)
             config, shifts = self._with(how.parameters)
-            hears = has_hearing(how.parameters)
             merger = WindowMerger(
-                config.merge, config.confirmation, shifts, bases, how.named, has_hearing=hears, owners=owners
+                config.merge,
+                config.confirmation,
+                shifts,
+                bases,
+                how.named,
+                has_hearing=has_hearing(how.parameters),
+                owners=owners,
+                judges_met=judges_met(how.parameters),
             )
             return merger.merge(state, reports, lattice_of_tile(begun, epoch, config.codec))
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gnd.cloud_merger.agreement import Agreement, agreement_of
 from gnd.cloud_merger.belief import Believed, ShiftTests, believed
 from gnd.cloud_merger.caps import Owners, capped
-from gnd.cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate
+from gnd.cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate, vouching_for
 from gnd.cloud_merger.groups import as_one, coincidences_of, owned_as_one
 from gnd.cloud_merger.hearing import Hearing, Spoken, all_heard, heard, spoken_of, without_silent
 from gnd.cloud_merger.memory import (
@@ -31,7 +31,18 @@ from gnd.cloud_merger.merge import MergedTile, MergeParameters, merge_tile
 from gnd.cloud_merger.parked import hold_parked, parked_after
 from gnd.cloud_merger.season import hold_season
 from gnd.cloud_merger.snapping import Snapping
-from gnd.cloud_merger.statements import EPOCH, Kind, Report, Rows, Statements, Witness, find, is_met, statements_of
+from gnd.cloud_merger.statements import (
+    EPOCH,
+    Kind,
+    Report,
+    Rows,
+    Statements,
+    Witness,
+    find,
+    is_met,
+    statements_of,
+    without_unsure,
+)
 from gnd.gnd_map.codec import Lattice, snap
 from gnd.gnd_map.day import day_of
 from gnd.gnd_map.gaussian import Gaussians
@@ -131,6 +142,8 @@ class WindowMerger:
         snapping: what the last merges have given, on their lattices.
         has_hearing: whether who is clearly wrong in a tile loses its vote there; versions of before were made without.
         owners: of vehicles, where their certificates tell them.
+        judges_met: whether what several met and none decides upon is one witness's word, and denied as claims are;
+            versions of before were made without.
     """
 
     rules: MergeParameters
@@ -141,6 +154,7 @@ class WindowMerger:
     snapping: Snapping = field(default_factory=Snapping)
     has_hearing: bool = True
     owners: Owners = field(default_factory=dict)
+    judges_met: bool = True
 
     def merge(self, state: TileState, reports: Sequence[Report], lattice: Lattice | None) -> MergedWindow:
         """Merge the reports of a window, in any order, into what the windows before it have come to.
@@ -148,6 +162,8 @@ class WindowMerger:
         `lattice`: on which the tile lies; None: none.
         """
         rules, agreement, marked = self.rules, Agreement(), Marked.of(self.named)
+        if not rules.together:
+            reports, state = without_unsure(reports), TileState(state.gaussians, state.memory.without_met())
         unheard: tuple[str, ...] = ()
         out, named = marked.counted_out, marked.shifted
         if rules.has_paper_rules:  # they know neither shift tests nor a gate nor a memory
@@ -158,7 +174,7 @@ class WindowMerger:
             shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
             in_play = believed(reports, shifts, named)
             told = self._told(state, in_play)
-            agreement = agreement_of(state.gaussians, told.statements, told.spoken, told.heard)
+            agreement = agreement_of(state.gaussians, told.statements, told.spoken, told.heard, self.judges_met)
             is_less = bool(out & {one.vehicle for one in in_play.reports})
             if is_less or self._is_of_groups(state, in_play.reports, marked):
                 in_play = in_play.without(out)
@@ -173,7 +189,8 @@ class WindowMerger:
             bare, leaves = hold_season(state.gaussians, merged, seen)
             free = hold_parked(state.gaussians, bare, seen, *standing)
             alone = agreement.contradicted | marked.contradicted
-            more = named, by, alone, marked.over_cap, marked.first_of
+            vouching = vouching_for(free.merged, statements) if self.judges_met else None
+            more = named, by, alone, marked.over_cap, marked.first_of, vouching
             found = gate(state.gaussians, free.merged, seen, self.confirmation, *more)
             waiting = (*found.waiting, *free.waiting, *leaves, *in_play.set_aside)
             gated = GatedTile(found.merged, waiting, found.alone, found.shared)

@@ -10,7 +10,7 @@ from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.features.kept import FeatureContents, said_of
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
 from gnd.cloud_merger.groups import joined
-from gnd.cloud_merger.map_parameters import has_hearing, text_of, with_text
+from gnd.cloud_merger.map_parameters import has_hearing, judges_met, text_of, with_text
 from gnd.cloud_merger.snapping import REMEMBERED_TILES, Snapping
 from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window
 from gnd.cloud_merger.window import WindowMerger, fold, provenance_of
@@ -208,6 +208,7 @@ class Worker:
             self._snapping,
             has_hearing(how.parameters),
             self._store.owners_of({row.vehicle for row in work.reports}),
+            judges_met(how.parameters),
         )
 
     def _of_features(self, work: TileWork) -> Publication:

@@ -14,7 +14,7 @@ from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.merge import MergeParameters, merge_tile
 from gnd.cloud_merger.parked import hold_parked
 from gnd.cloud_merger.season import hold_season
-from gnd.cloud_merger.statements import Report, statements_of
+from gnd.cloud_merger.statements import Report, statements_of, without_unsure
 from gnd.cloud_merger.votes import TileVotes
 from gnd.cloud_merger.wants import Known, WantParameters, wanted
 from gnd.gnd_map.arrays import are_in
@@ -53,7 +53,8 @@ def merged_map(
 ) -> dict[TileId, Gaussians]:
     """Return the map that the cloud makes of a base map and uploads; `parked_h`: see `ConfirmationParameters`."""
     final = dict(base.tiles)
-    for tile, reports in reports_of_tiles(bodies, parameters).items():
+    for tile, told in reports_of_tiles(bodies, parameters).items():
+        reports = told if parameters.together else list(without_unsure(told))
         epoch = base.tiles.get(tile, Gaussians.empty())
         bases = {base.shas[tile]: epoch} if tile in base.shas else {}
         merged = merge_tile(epoch, statements_of(epoch, reports, bases, parameters.mode), parameters)

@@ -11,6 +11,7 @@ from merger_world import BALL, GROUND, WALL, change_of, gaussians_of, report_of
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import rows_of
+from gnd.cloud_merger.merge import MergeParameters
 from gnd.cloud_merger.verify import Verifier
 from gnd.cloud_merger.work import Worker
 from gnd.deploy.cli import gnd
@@ -27,6 +28,7 @@ TILES = [TileId(FIRST + number) for number in range(4)]
 NS = 1_700_000_000_000_000_000
 CAR = (0.0, 0.0, 0.0, 0.25, 0.25, 0.2)
 WIDE = 24  # voxels of a wall
+USUAL = MergeParameters()
 
 
 def wall_of(tile: TileId) -> list[int]:
@@ -75,11 +77,13 @@ def store(tmp_path: Path) -> Iterable[SqliteStore]:
         yield store
 
 
-def take(store: SqliteStore, reports: Iterable[ChangeReport], received_ns: int = NS) -> None:
+def take(
+    store: SqliteStore, reports: Iterable[ChangeReport], received_ns: int = NS, merge: MergeParameters = USUAL
+) -> None:
     """Put reports and merge until nothing waits."""
     for one in reports:
-        store.put_reports(rows_of(one, received_ns))
-    config = ShardConfig("one", store.path, store=StoreConfig(merge_delay_s=0.0))
+        store.put_reports(rows_of(one, received_ns, together=merge.together))
+    config = ShardConfig("one", store.path, merge=merge, store=StoreConfig(merge_delay_s=0.0))
     worker = Worker(store, config)
     while claims := store.claim("one", 16, 60.0):
         worker.begin(claims)

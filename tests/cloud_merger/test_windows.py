@@ -24,6 +24,7 @@ from merger_world import (
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import rows_of
 from gnd.cloud_merger.memory import CLAIMS_OF_VEHICLE, CLAIMS_OF_VOXEL, TileMemory
+from gnd.cloud_merger.merge import MergeParameters
 from gnd.cloud_merger.stored import decode_state
 from gnd.cloud_merger.verify import Verifier
 from gnd.cloud_merger.work import Worker
@@ -41,8 +42,9 @@ START_NS = 1_800_000_000_000_000_000
 class Cloud:
     """A store and a worker; vehicles come by, each with the newest version unless another is named."""
 
-    def __init__(self, path, **store):
-        self.config = ShardConfig(store_path=path, confirmation=VOXEL_BY_VOXEL)
+    def __init__(self, path, together=False, **store):
+        merge = MergeParameters(together=together)
+        self.config = ShardConfig(store_path=path, confirmation=VOXEL_BY_VOXEL, merge=merge)
         self.now_ns = START_NS
         self.store = SqliteStore(path, StoreConfig(merge_delay_s=0.0, **store), now_ns=lambda: self.now_ns)
         self.store.put_tiles([Tile(TILE, 1, gaussians_of(BASE))])
@@ -64,7 +66,7 @@ class Cloud:
         times = {"first_ns": self.now_ns - 10**9, "last_ns": self.now_ns}
         report = replace(report_of(self.number, change, vehicle=vehicle), **times)
         ((tile, body),) = split(report)
-        (row,) = rows_of(report, self.now_ns)
+        (row,) = rows_of(report, self.now_ns, together=self.config.merge.together)
         assert (row.tile, row.body) == (tile, body)
         self.store.put_reports([row])
         return report
@@ -93,6 +95,14 @@ class Cloud:
 @pytest.fixture
 def cloud(tmp_path):
     made = Cloud(tmp_path / "map.sqlite")
+    yield made
+    made.store.close()
+
+
+@pytest.fixture
+def adding(tmp_path):
+    """A cloud that adds up what vehicles met."""
+    made = Cloud(tmp_path / "map.sqlite", together=True)
     yield made
     made.store.close()
 
@@ -158,33 +168,33 @@ def test_vehicles_that_each_saw_too_little_decide_together_over_many_windows(clo
     assert cloud.ids() == [0, 1, 2, 3]
 
 
-def test_what_several_met_is_published_remembered_and_computed_anew(cloud):
+def test_what_several_met_is_published_remembered_and_computed_anew(adding):
     """The voxel of which each is unsure is new for all of them; later windows confirm it, and every version is what the
     journal gives.
     """
-    cloud.sees(["one"], observed=[0, 1, 2], unsure={3: WALL})
-    assert cloud.ids() == [0, 1, 2]
-    cloud.sees(["two"], observed=[0, 1, 2], unsure={3: WALL}, base=gaussians_of(BASE))
-    assert cloud.ids() == [0, 1, 2, 3]
+    adding.sees(["one"], observed=[0, 1, 2], unsure={3: WALL})
+    assert adding.ids() == [0, 1, 2]
+    adding.sees(["two"], observed=[0, 1, 2], unsure={3: WALL}, base=gaussians_of(BASE))
+    assert adding.ids() == [0, 1, 2, 3]
     for k in range(40):
-        cloud.sees([f"later-{k}"], observed=[0, 1, 2, 3], later_s=400)
-    assert cloud.ids() == [0, 1, 2, 3]
-    known = cloud.state().memory.voxels
+        adding.sees([f"later-{k}"], observed=[0, 1, 2, 3], later_s=400)
+    assert adding.ids() == [0, 1, 2, 3]
+    known = adding.state().memory.voxels
     assert known["observers"][known["voxel_id"] == 3] > 2
-    assert set(cloud.verified()) == {"given", "same"}
+    assert set(adding.verified()) == {"given", "same"}
 
 
-def test_what_two_met_against_a_settled_voxel_is_remembered_until_enough_have_met_it(cloud):
+def test_what_two_met_against_a_settled_voxel_is_remembered_until_enough_have_met_it(adding):
     """Many found nothing there, window for window; then a thing comes that each vehicle meets too seldom."""
-    cloud.sees(crowd(12), observed=EVERYTHING, later_s=400)
-    assert cloud.ids() == [0, 1, 2]
+    adding.sees(crowd(12), observed=EVERYTHING, later_s=400)
+    assert adding.ids() == [0, 1, 2]
     needed = 0
-    while cloud.ids() == [0, 1, 2] and needed < 40:
+    while adding.ids() == [0, 1, 2] and needed < 40:
         needed += 2
-        cloud.sees([f"a-{needed}", f"b-{needed}"], observed=[0, 1, 2], unsure={3: WALL}, later_s=60)
-        cloud.now_ns += HOUR_NS
+        adding.sees([f"a-{needed}", f"b-{needed}"], observed=[0, 1, 2], unsure={3: WALL}, later_s=60)
+        adding.now_ns += HOUR_NS
     assert 4 <= needed <= 12
-    assert set(cloud.verified()) == {"given", "same"}
+    assert set(adding.verified()) == {"given", "same"}
 
 
 def test_each_confirmation_takes_a_claim_away(cloud):
