@@ -281,11 +281,8 @@ class Expander:
         return _Outcome(settled, upload.vehicle, told, asks)
 
 
-def rows_of(
-    report: ChangeReport, received_ns: int, part: int = 0, *, together: bool = False
-) -> tuple[ReportRow, ...]:
-    """A report as the journal keeps it: one row a tile. `together`: what it does not decide upon is to be merged, too.
-    """
+def rows_of(report: ChangeReport, received_ns: int, part: int = 0, *, together: bool = False) -> tuple[ReportRow, ...]:
+    """A report as the journal keeps it: one row a tile. `together`: what it does not decide upon is to be merged, too."""
     return tuple(
         ReportRow(
             report.report_id, report.layer, tile, report.vehicle, received_ns, body, change.base_sha, part,

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import rows_of
+from gnd.cloud_merger.merge import MergeParameters
 from gnd.cloud_merger.work import Worker
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
@@ -52,13 +53,14 @@ class CloudRun:
         return {f"honest_{name}": len(those & vehicles) for name, those in found.items()}
 
 
-def run_cloud(base: BaseMap, fleet: Sequence[Sequence[ChangeReport]]) -> CloudRun:
-    """Take the reports of vehicles in the order in which they come, merge after each vehicle."""
-    with _store(base) as (store, worker):
+def run_cloud(base: BaseMap, fleet: Sequence[Sequence[ChangeReport]], merge: MergeParameters | None = None) -> CloudRun:
+    """Take the reports of vehicles in the order in which they come, merge after each vehicle; `merge`: how."""
+    rules = merge or MergeParameters()
+    with _store(base, rules) as (store, worker):
         run, told = CloudRun({}), dict[str, int]()
         for reports in fleet:
             for one in sorted(reports, key=lambda report: report.last_ns):
-                store.put_reports(rows_of(one, one.last_ns + _LATE_NS))
+                store.put_reports(rows_of(one, one.last_ns + _LATE_NS, together=rules.together))
                 told[one.vehicle] = told.get(one.vehicle, 0) + len(one.tiles)
             merge_all(store, worker)
             run.quarantined = store.quarantined_vehicles()
@@ -82,10 +84,10 @@ def merge_all(store: SqlStore, worker: Worker) -> None:
 
 
 @contextmanager
-def _store(base: BaseMap) -> Iterator[tuple[SqlStore, Worker]]:
+def _store(base: BaseMap, merge: MergeParameters) -> Iterator[tuple[SqlStore, Worker]]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "map.sqlite"
-        config = ShardConfig("study", path, store=StoreConfig(merge_delay_s=0.0))
+        config = ShardConfig("study", path, merge=merge, store=StoreConfig(merge_delay_s=0.0))
         with SqliteStore(path, config.store) as store:
             store.put_tiles([Tile(tile, 0, gaussians) for tile, gaussians in base.tiles.items()])
             yield store, Worker(store, config)

@@ -7,15 +7,16 @@ from typing import Any, Final
 
 import numpy as np
 
+from gnd.cloud_merger.merge import MergeParameters
 from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport
 from studies.frame.command import Bench, StudyReport, study
-from studies.frame.options import check, option, seeds
+from studies.frame.options import check, option, parts, seeds
 from studies.frame.pool import Job
 from studies.frame.tables import sheet_of
-from studies.simulation.options import RunOptions, street_option
+from studies.simulation.options import SET, MethodParameters, RunOptions, method_of, street_option
 from studies.simulation.scores import MapScorer, VehicleFile
 from studies.simulation.study import drive_jobs
 from studies.simulation.worlds import WorldFiles, prepare_world, vehicle_tasks, world_files
@@ -62,6 +63,7 @@ class TrustOptions:
     street: Any = street_option(120.0)
     apart_min: float = option(3.0, "Minutes between the starts of two vehicles.", "--apart", span=(0, 1e5))
     parking: float | None = option(None, "Share of parking slots that are taken.", span=(0, 1))
+    method: MethodParameters = parts(method_of, changes=SET)
 
     def __post_init__(self) -> None:
         check(self)
@@ -74,6 +76,7 @@ class TrustOptions:
             vehicles=(self.vehicles,),
             apart_min=self.apart_min,
             parking=self.parking,
+            method=self.method,
             pcd=False,
         )
 
@@ -90,7 +93,7 @@ def trust(options: TrustOptions, bench: Bench) -> StudyReport:
     kinds = tuple(kind for kind in options.kinds if kind != HONEST_ONLY)
     names = ("honest", *kinds)
     jobs = [
-        Job(f"{kind}, world {seed}", run_kind, (files[seed], kept[seed], kind, options.bad, seed))
+        Job(f"{kind}, world {seed}", run_kind, (files[seed], kept[seed], kind, options.bad, seed, options.method.merge))
         for seed in files
         for kind in names
     ]
@@ -105,12 +108,14 @@ def trust(options: TrustOptions, bench: Bench) -> StudyReport:
     return StudyReport(found, sheets, file="trust.json")
 
 
-def run_kind(files: WorldFiles, vehicles: Sequence[VehicleFile], kind: str, share: float, seed: int) -> dict[str, Any]:
+def run_kind(
+    files: WorldFiles, vehicles: Sequence[VehicleFile], kind: str, share: float, seed: int, merge: MergeParameters
+) -> dict[str, Any]:
     """One fleet with its bad vehicles, and the same fleet without them."""
     scorer = MapScorer(files)
     honest = [[ChangeReport.decode(body) for body in one.read().reports] for one in vehicles[: _SMALL.get(kind)]]
     if kind == "honest":
-        run = run_cloud(scorer.base, honest)
+        run = run_cloud(scorer.base, honest, merge)
         names = {one.vehicle for reports in honest for one in reports}
         return run.judgements(names) | {"f1": scorer.score(run.tiles).f1(), "honest": len(honest), "alone": run.alone}
     bad = bad_ones(len(honest), kind, share, seed)
@@ -123,8 +128,8 @@ def run_kind(files: WorldFiles, vehicles: Sequence[VehicleFile], kind: str, shar
         about = Lies(scorer.base.tiles, seed if kind in TOGETHER else 1000 * seed + turn, turn)
         lies.append(lie_of(kind, turn)(reports, about))
         fleet.append(lies[-1])
-    clean = run_cloud(scorer.base, [reports for number, reports in enumerate(honest) if number not in bad])
-    dirty = run_cloud(scorer.base, fleet)
+    clean = run_cloud(scorer.base, [reports for number, reports in enumerate(honest) if number not in bad], merge)
+    dirty = run_cloud(scorer.base, fleet, merge)
     true = [one for number, reports in enumerate(honest) if number not in bad for one in reports]
     return _row(scorer, clean, dirty, lies, true, len(honest))
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.verify import Verifier
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile, content_sha
@@ -138,6 +140,24 @@ class Street:
         self.say("last", {tile: {_voxels(tile, 7, (39,))[0]: None} for tile in self.tiles})
         self.settle()
 
+    def new(self) -> list[int]:
+        """Of each tile how many voxels it holds where the map held nothing."""
+        heads = [self.cloud.store.get("ndt", tile) for tile in self.tiles]
+        held = [set() if head is None else {*head.decode_gaussians().gaussians.voxel_id.tolist()} for head in heads]
+        return [len(ids & {*free(tile)}) for ids, tile in zip(held, self.tiles, strict=True)]
+
+    def statuses(self) -> set[str]:
+        """What comes of computing all versions of all tiles anew."""
+        verifier = Verifier(self.cloud.store, ShardConfig("verifier", self.cloud.path))
+        history = [(tile, one.version) for tile in self.tiles for one in self.cloud.store.history("ndt", tile)]
+        return {verifier.version("ndt", *one).status for one in history}
+
+    def not_believed_alone(self) -> dict[str, str]:
+        """Of this street's vehicles those whose lone word waits everywhere, and why."""
+        end = f"-{self.number}"
+        words = [one for one in self.cloud.store.lone_words() if one.vehicle.endswith(end)]
+        return {one.vehicle.removesuffix(end): one.why for one in words}
+
     def quarantined(self) -> set[str]:
         """Those of this street whose reports do not count."""
         end = f"-{self.number}"
@@ -149,9 +169,10 @@ class Street:
 
 
 @contextmanager
-def guarded_cloud(folder: Path, port: int) -> Iterator[Cloud]:
-    """A cloud with all streets."""
+def guarded_cloud(folder: Path, port: int, settings: str = "") -> Iterator[Cloud]:
+    """A cloud with all streets; `settings`: more of its shard, as TOML."""
     cloud = Cloud(folder, port)
+    cloud.config_path.write_text(cloud.config_path.read_text() + settings)
     cloud.open()
     try:
         cloud.store.put_tiles([Tile(one, 1, base(one)) for n in range(STREETS) for one in Street(cloud, n).tiles])

@@ -129,9 +129,7 @@ def test_switching_it_off_takes_remembered_votes_away_too() -> None:
         change = change_of(epoch, [0, 1] if unsure else [0, 1, 7], {})
         change = replace(change, unsure=gaussians_of({7: BALL} if unsure else {}, 10, 10))
         at_ns = NS + number * 10**13
-        return Report(
-            report_id(number), change, vehicle=vehicle, first_ns=at_ns, last_ns=at_ns, received_ns=at_ns
-        )
+        return Report(report_id(number), change, vehicle=vehicle, first_ns=at_ns, last_ns=at_ns, received_ns=at_ns)
 
     state = TileState(epoch, TileMemory())
     for window in ([one(k, f"empty-{k}", False) for k in range(3)], [one(4, "a", True), one(5, "b", True)]):
