@@ -66,6 +66,10 @@ class ConfirmationParameters:
         "less surely.",
         least=1,
     )
+    copies: bool = setting(
+        True,
+        "Whether vehicles that send the same measurements to the bit, which two drives never give, are one witness.",
+    )
     parked_h: float = setting(
         18.0,
         "What is new and has the shape of a vehicle must have stood for so long, whoever saw it; each time that "

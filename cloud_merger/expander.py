@@ -282,7 +282,7 @@ class Expander:
 
 
 def rows_of(report: ChangeReport, received_ns: int, part: int = 0, *, together: bool = False) -> tuple[ReportRow, ...]:
-    """A report as the journal keeps it: one row a tile. `together`: what it does not decide upon is to be merged, too."""
+    """A report as the journal keeps it: one row a tile. `together`: what it does not decide upon is merged, too."""
     return tuple(
         ReportRow(
             report.report_id, report.layer, tile, report.vehicle, received_ns, body, change.base_sha, part,

@@ -15,7 +15,7 @@ from gnd.cloud_merger.agreement import Agreement, agreement_of
 from gnd.cloud_merger.belief import Believed, ShiftTests, believed
 from gnd.cloud_merger.caps import Owners, capped
 from gnd.cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate, vouching_for
-from gnd.cloud_merger.groups import as_one, coincidences_of, owned_as_one
+from gnd.cloud_merger.groups import as_one, coincidences_of, copies_of, joined, owned_as_one
 from gnd.cloud_merger.hearing import Hearing, Spoken, all_heard, heard, spoken_of, without_silent
 from gnd.cloud_merger.memory import (
     ANOTHER_DRIVE_S,
@@ -80,7 +80,7 @@ class MergedWindow:
         parked: what has the shape of a vehicle and is held back.
         bases: Gaussians of the versions that the reports refer to, by content hash.
         denied: of each vehicle its claims that somebody else has seen, too, and how many of them are denied.
-        coincidences: how far the claims of refuted reports coincide.
+        coincidences: how far the claims of refuted reports coincide, and who has sent the same measurements.
         unheard: vehicles, once for each kind of statement of theirs that does not count.
         carries_quotes: whether "as in an older version" is remembered as a claim; it was not by the rules of before.
     """
@@ -165,6 +165,7 @@ class WindowMerger:
         if not rules.together:
             reports, state = without_unsure(reports), TileState(state.gaussians, state.memory.without_met())
         unheard: tuple[str, ...] = ()
+        copies: tuple[Coincidence, ...] = ()
         out, named = marked.counted_out, marked.shifted
         if rules.has_paper_rules:  # they know neither shift tests nor a gate nor a memory
             in_play = Believed(tuple(reports), (), ())
@@ -174,6 +175,7 @@ class WindowMerger:
             shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
             in_play = believed(reports, shifts, named)
             told = self._told(state, in_play)
+            copies = copies_of(reports, told.uncapped) if self.confirmation.copies else ()
             agreement = agreement_of(state.gaussians, told.statements, told.spoken, told.heard, self.judges_met)
             is_less = bool(out & {one.vehicle for one in in_play.reports})
             if is_less or self._is_of_groups(state, in_play.reports, marked):
@@ -198,7 +200,7 @@ class WindowMerger:
         gaussians = self._on_lattice(gated.merged, reports, lattice)
         return MergedWindow(
             tuple(reports), in_play, statements, gated, gaussians, parked, self.bases, agreement.tests,
-            self.has_hearing, agreement.denied, coincidences_of(reports, agreement.tests), unheard,
+            self.has_hearing, agreement.denied, joined([*coincidences_of(reports, agreement.tests), *copies]), unheard,
         )  # fmt: skip
 
     def _is_of_groups(self, state: TileState, reports: Sequence[Report], marked: Marked) -> bool:

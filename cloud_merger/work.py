@@ -9,11 +9,12 @@ from gnd.cloud_merger.belief import ShiftTests, courses_of
 from gnd.cloud_merger.config import MAX_ATTEMPTS, RETRY_S, ShardConfig
 from gnd.cloud_merger.features.kept import FeatureContents, said_of
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
-from gnd.cloud_merger.groups import joined
+from gnd.cloud_merger.groups import joined, with_copies
 from gnd.cloud_merger.map_parameters import has_hearing, judges_met, text_of, with_text
 from gnd.cloud_merger.snapping import REMEMBERED_TILES, Snapping
+from gnd.cloud_merger.statements import Report
 from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window
-from gnd.cloud_merger.window import WindowMerger, fold, provenance_of
+from gnd.cloud_merger.window import MergedWindow, TileState, WindowMerger, fold, provenance_of
 from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import Feature, FeatureTile, is_feature_layer
@@ -145,21 +146,13 @@ class Worker:
 
     def _of_gaussians(self, work: TileWork, named: frozenset[str]) -> Publication:
         """Of a tile of the voxel map."""
-        tile, config = work.claim.tile, self._config
-        epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
-        now_so = ClosedWindow(named, self._parameters)
-        lattice = lattice_of_tile(work.epoch, epoch, config.codec)
-        by_window = reports_by_window(work.reports, config.merge, self._unreadable)
-        # windows that were closed before and are folded anew, because somebody else counts now
-        again = self._folded_before(work, by_window, named)
-        mergers = {how: self._merger(work, how) for how in {now_so, *again.values()}}
-        state, merges, closed = _through_windows(
-            self._contents.state(tile, work.journal),
-            by_window,
-            work.journal.window,
-            lambda window, state, reports: mergers[again.get(window, now_so)].merge(state, reports or [], lattice),
-            lambda state, merged, _reports: fold(state, merged),
-        )
+        tile = work.claim.tile
+        by_window = reports_by_window(work.reports, self._config.merge, self._unreadable)
+        state, merges, closed, again = self._merged(work, by_window, named)
+        with_new = with_copies(named, joined(one for merged in merges for one in merged.coincidences))
+        if with_new != named:  # what was sent twice decides in no version, not even until the store knows
+            named = with_new
+            state, merges, closed, again = self._merged(work, by_window, named)
         now, version = merges[-1], work.base_version + 1
         # others were judged when they were closed
         windows = zip([*closed, work.journal.window], merges, strict=True)
@@ -180,6 +173,26 @@ class Worker:
             courses=courses_of(one for reports in by_window.values() for one in reports),
             memory=encode_state(tile, closed[-1], state) if closed else None,
         )
+
+    def _merged(
+        self, work: TileWork, by_window: Mapping[int, Sequence[Report]], named: frozenset[str]
+    ) -> tuple[TileState, list[MergedWindow], list[int], Mapping[int, ClosedWindow]]:
+        """What `_through_windows` gives, and of the closed windows those that were folded before and are folded anew,
+        because somebody else counts now.
+        """
+        epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
+        now_so = ClosedWindow(named, self._parameters)
+        lattice = lattice_of_tile(work.epoch, epoch, self._config.codec)
+        again = self._folded_before(work, by_window, named)
+        mergers = {how: self._merger(work, how) for how in {now_so, *again.values()}}
+        state, merges, closed = _through_windows(
+            self._contents.state(work.claim.tile, work.journal),
+            by_window,
+            work.journal.window,
+            lambda window, state, reports: mergers[again.get(window, now_so)].merge(state, reports or [], lattice),
+            lambda state, merged, _reports: fold(state, merged),
+        )
+        return state, merges, closed, again
 
     def _folded_before(
         self, work: TileWork, by_window: Mapping[int, object], named: frozenset[str]

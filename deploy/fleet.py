@@ -89,6 +89,8 @@ def run_fleet(
         DeployError: a process cannot be kept alive, the port is taken, or the deadline has passed.
     """
     started_s = time.monotonic()
+    if prepared.repeats:  # of one recording two vehicles measure the same to the bit; here they are to confirm it
+        config = replace(config, merger=merged({"confirmation": {"copies": False}}, config.merger))
     site = site or loopback_site(config, len(prepared.agent_drives), prepared.identities)
     links = {vehicle_name(n): load_link(place.link) for n, place in enumerate(site.vehicles)}
     state = FleetState(links=links, ledgers=LiveLedgers(folder.root))

@@ -36,6 +36,7 @@ class PreparedRun:
         world: the simulated world itself, None for recorded drives.
         made_up: boxes that were put into the recorded drives, None where none were.
         identities: folder of the processes' identities, None in a plain fleet.
+        repeats: whether several vehicles drive the same recording.
     """
 
     agent_drives: tuple[Path, ...]
@@ -44,6 +45,7 @@ class PreparedRun:
     world: Path | None = None
     made_up: MadeUp | None = None
     identities: Path | None = None
+    repeats: bool = False
 
 
 def prepare(config: FleetConfig, folder: RunFolder, source: Source, progress: Progress) -> PreparedRun:
@@ -174,7 +176,7 @@ def prepare_recorded(config: FleetConfig, folder: RunFolder, source: Source) -> 
         copy_store(source.base_map, folder.store)
     count = len(found) if source.agents is None else config.agents
     drives = tuple(itertools.islice(itertools.cycle(found), count))
-    return PreparedRun(drives, None, starts_of(count, config.headway_s))
+    return PreparedRun(drives, None, starts_of(count, config.headway_s), repeats=len(set(drives)) < len(drives))
 
 
 def find_drives(paths: tuple[Path, ...]) -> list[Path]:

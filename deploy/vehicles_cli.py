@@ -125,7 +125,9 @@ def _print_list(console: Console, path: str, found: list[VehicleTrust], lines: l
 
 def _said_together(group: dict[str, Any]) -> str:
     names = ", ".join(group["vehicles"])
-    said = f"{names} say the same false things: {group['shared']} voxels, {group['by_chance']:.0f} by chance"
+    said = f"{names} have sent the same measurements, to the bit, in {group['shared']} voxels"
+    if group["by_chance"] > 0.0:
+        said = f"{names} say the same false things: {group['shared']} voxels, {group['by_chance']:.0f} by chance"
     return said + "; they have one vote"
 
 

@@ -143,14 +143,16 @@ def put_coincidences(
     judged: Iterable[str],
     timing: Mapping[str, Any],
 ) -> None:
-    """Enter how far refuted claims in a tile coincide, of the vehicles that were judged in it now. Where that changes
-    who says the same false things, the open tiles of those are merged again.
+    """Enter how far refuted claims in a tile coincide, of the vehicles that were judged in it now, and who has sent
+    the same measurements: that stays, whatever they send later. Where it changes who has one vote with whom, the open
+    tiles of those are merged again.
     """
     place, vehicles = {"layer": layer, "tile": tile.morton}, set(judged)
     now = {(one.one, one.other): one for one in coincidences}
-    rows = fetch(c, "coincidences_of_tile", place) if vehicles else []
-    before = {(row[0], row[1]): Coincidence(*row) for row in rows if vehicles.issuperset(row[:2])}
-    pairs = sorted(pair for pair in before.keys() | now.keys() if before.get(pair) != now.get(pair))
+    rows = fetch(c, "coincidences_of_tile", place) if vehicles or now else []
+    held = {(row[0], row[1]): Coincidence(*row) for row in rows}
+    before = {pair: one for pair, one in held.items() if pair in now or vehicles.issuperset(pair)}
+    pairs = [pair for pair in sorted(before.keys() | now.keys()) if _is_other(before.get(pair), now.get(pair))]
     if not pairs:
         return
     for one, other in pairs:
@@ -167,6 +169,13 @@ def put_coincidences(
     for vehicle in sorted(known.keys() | found.keys()):
         if known.get(vehicle) != found.get(vehicle):
             _merge_open_tiles_again(c, vehicle, timing)
+
+
+def _is_other(old: Coincidence | None, new: Coincidence | None) -> bool:
+    """Whether what is known of a pair changes."""
+    if old is None or not old.is_copy:
+        return old != new
+    return new is not None and new.is_copy and new.shared > old.shared
 
 
 def _pair(c: SqlConnection, one: str, other: str, timing: Mapping[str, Any]) -> None:

@@ -553,14 +553,15 @@ class VehicleStanding:
 
 @dataclass(frozen=True, slots=True)
 class Coincidence:
-    """How far what two vehicles claim coincides in a tile in which others contradict both as a whole.
+    """How far what two vehicles claim coincides in a tile in which others contradict both as a whole; or that the one
+    has sent what the other has measured, to the bit.
 
     Attributes:
         one: the vehicle that comes first by name.
         other: the other.
         shared: voxels of which both claim the same.
-        by_chance: how many would coincide by chance.
-        least: claims of who claims less.
+        by_chance: how many would coincide by chance; 0 of copies.
+        least: claims of who claims less; of copies the voxels that both have measured.
     """
 
     one: str
@@ -568,6 +569,11 @@ class Coincidence:
     shared: int
     by_chance: float
     least: int
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether it tells of the same measurements."""
+        return self.shared > 0 and self.by_chance == 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 
 from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.confirmation import ConfirmationParameters
 from gnd.deploy import roles
 from gnd.deploy.chaos import clients
 from gnd.deploy.chaos.street import LAYER, ChaosStreet
@@ -158,7 +159,13 @@ def _cloud_processes(cloud: ChaosCloud) -> list[ProcessSpec]:
     path = cloud.path
     configs = [
         ShardConfig(
-            f"shard-{n}", path, (cloud.connect,), bus_lease_ms=BUS_LEASE_MS, lease_s=LEASE_S, poll_s=SHARD_POLL_S
+            f"shard-{n}",
+            path,
+            (cloud.connect,),
+            bus_lease_ms=BUS_LEASE_MS,
+            confirmation=ConfirmationParameters(copies=False),  # all reports are parts of one drive
+            lease_s=LEASE_S,
+            poll_s=SHARD_POLL_S,
         )
         for n in range(SHARDS)
     ]

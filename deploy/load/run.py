@@ -137,7 +137,11 @@ def _cloud(options: LoadOptions, runs: KeptRuns, folder: Path, stop: threading.E
     connect = f"tcp/127.0.0.1:{claim_port(0)}"
     store = folder / "store.sqlite"
     made = (shard_config(FleetConfig(), f"shard-{n}", store, connect) for n in range(options.shards))
-    shards = [replace(one, ingest=IngestLimits(speeds=False)) for one in made]  # streets lie districts apart
+    # streets lie districts apart, and vehicles that follow each other send the same drives
+    shards = [
+        replace(one, ingest=IngestLimits(speeds=False), confirmation=replace(one.confirmation, copies=False))
+        for one in made
+    ]
     clients = [
         ClientConfig(number, vehicles, options, runs, connect, folder)
         for number, vehicles in enumerate(shared_out(options.vehicles, options.clients))

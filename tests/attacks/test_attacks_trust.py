@@ -342,8 +342,8 @@ def test_attack_a_gang_that_is_known(cloud: Cloud) -> None:
 
 @pytest.mark.parametrize(("number", "colluders"), [(20, "xy"), (21, "xyz")])
 def test_attack_counters_of_colluders(cloud: Cloud, number: int, colluders: str) -> None:
-    """Two, and three, vehicles tell the cloud that they met as much as may be told in voxels where nothing is: unless it
-    is told to add that up, nothing is published, nothing waits, and every version verifies.
+    """Two, and three, vehicles tell the cloud that they met as much as may be told in voxels where nothing is: unless
+    it is told to add that up, nothing is published, nothing waits, and every version verifies.
     """
     street = Street(cloud, number)
     for _ in range(2):
@@ -395,10 +395,33 @@ def test_attack_counters_that_make_an_honest_vehicle_wrong(adding: Cloud) -> Non
     assert street.quarantined() == set()
 
 
+def test_attack_one_drive_under_two_names(cloud: Cloud) -> None:
+    """A vehicle sends what it has measured on one drive under two names, right away and an hour later, and a third
+    one: all of it is one vehicle's word, and waits, in the tile that is sent later, too. Another vehicle's own
+    measurement of the same walls is a second word.
+    """
+    street = Street(cloud, 22)
+    first, later = street.tiles[:3], street.tiles[3:]
+    for vehicle, at_s in (("one", 60), ("two", 70), ("three", 3700)):
+        street.say(vehicle, street.built, at_s=at_s, tiles=first, as_measured=True)
+        street.settle()
+        assert street.new() == [0] * 4
+    assert {one.vehicle for one in cloud.store.waiting_changes() if one.vehicle.endswith("-22")} == {street.name("one")}
+    for vehicle in ("two", "three"):
+        street.say(vehicle, street.built, at_s=3800, tiles=later, as_measured=vehicle == "two")
+    street.settle()
+    assert street.new() == [0] * 4
+    street.say("honest", street.built, at_s=3900)
+    street.settle()
+    assert street.new() == [48] * 4
+    assert street.quarantined() == set()
+    assert street.statuses() <= {"same", "given"}
+
+
 def test_attack_large_counters(adding: Cloud) -> None:
     """One vehicle tells again and again that it met as much as may be told in empty voxels, another met a little there
     by chance: nobody counts for more than all others together, so nothing is published. Nor is it where another met
-    much and two saw nothing. Where nobody saw it empty, two that met much publish what one witness may, and it verifies.
+    much and two saw nothing. Where nobody saw it empty, two that met much publish what one witness may.
     """
     street = Street(adding, 3)
     for _ in range(9):

@@ -18,7 +18,7 @@ from gnd.schemas.changes import ChangeReport
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "cloud_merger"))
 from merger_processes import Cloud, wait_for
-from merger_world import BALL, GROUND, WALL, State, change_of, gaussians_of, report_of
+from merger_world import BALL, GROUND, WALL, State, change_of, gaussians_of, report_of, seen_by
 
 SHARD = "guarded"
 FIRST = 497353963152
@@ -105,9 +105,10 @@ class Street:
         tiles: Sequence[TileId] = (),
         unsure: Changes = NOTHING,
         cells: int = 0,
+        as_measured: bool = False,
     ) -> ChangeReport:
         """What a vehicle says of all tiles, or of some; all else is as in the map, but for what it is unsure of, with
-        so many cells. Vehicles drive a minute after each other.
+        so many cells. Vehicles drive a minute after each other. `as_measured`: without noise of its own.
         """
         self.sent += 1
         at_ns = NS + (60 * self.sent if at_s is None else at_s) * 10**9
@@ -115,7 +116,8 @@ class Street:
         for tile in tiles or self.tiles:
             met = gaussians_of(unsure.get(tile, {}), cells, cells)
             seen = sorted({*base(tile).voxel_id.tolist(), *free(tile)} - {*met.voxel_id.tolist()})
-            said = change_of(base(tile), seen, changes.get(tile, {}), tile=tile)
+            changed = changes.get(tile, {}) if as_measured else seen_by(vehicle, changes.get(tile, {}))
+            said = change_of(base(tile), seen, changed, tile=tile)
             told.append(replace(said, unsure=met))
         made = report_of(1000 * self.number + self.sent, *told, vehicle=self.name(vehicle))
         return replace(made, first_ns=at_ns - 20 * 10**9, last_ns=at_ns)

@@ -1,6 +1,8 @@
 """Small tiles and reports for the tests of the merger."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from zlib import crc32
 
 import numpy as np
 
@@ -42,6 +44,23 @@ def gaussians_of(states: Mapping[int, State | None], count: int = 200, cells: in
         rows[:, :3].astype(np.float32),
         cov,
     )
+
+
+def seen_by(vehicle: str, states: Mapping[int, State | None]) -> dict[int, State | None]:
+    """The states as one vehicle measures them: no two measure the same to the bit."""
+    n = crc32(vehicle.encode())
+    off = 0.01 * (n % 11 - 5), 0.01 * (n // 11 % 11 - 5)
+    return {
+        voxel: None if state is None else (state[0] + off[0], state[1] + off[1], *state[2:])
+        for voxel, state in states.items()
+    }
+
+
+def measured_anew(vehicle: str, change: TileChange) -> TileChange:
+    """The change as another vehicle measures it."""
+    off = np.float32(0.001 * (crc32(vehicle.encode()) % 100))
+    mean_m = change.changed.mean_m + off * change.changed.exists[:, None]
+    return replace(change, changed=replace(change.changed, mean_m=mean_m.astype(np.float32)))
 
 
 def sha_of(base: Gaussians | None, tile: TileId = TILE) -> bytes:

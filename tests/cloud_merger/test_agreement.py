@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from merger_world import BALL, GROUND, WALL, change_of, gaussians_of, report_of
+from merger_world import BALL, GROUND, WALL, change_of, gaussians_of, report_of, seen_by
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import rows_of
@@ -60,7 +60,8 @@ def says(number: int, vehicle: str, changed: Mapping[TileId, Mapping[int, object
     """What a vehicle says of all tiles: these changes, all else is as in the base."""
     found = []
     for k, tile in enumerate(TILES):
-        change = change_of(base_of(tile), observed(tile), changed.get(tile, {}), tile=tile)  # type: ignore[arg-type]
+        told = seen_by(vehicle, changed.get(tile, {}))  # type: ignore[arg-type]
+        change = change_of(base_of(tile), observed(tile), told, tile=tile)
         found.append(at(number, report_of(100 * number + k, change, vehicle=vehicle)))
     return found
 

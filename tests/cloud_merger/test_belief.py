@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from merger_world import TILE, gaussians_of, report_of, sha_of
+from merger_world import TILE, gaussians_of, measured_anew, report_of, sha_of
 from rich.console import Console
 from street_corner import WALLS, displaced, mapped, seen_as, street
 
@@ -145,7 +145,8 @@ def merge_all(store):
 
 
 def test_a_shifted_vehicle_among_four_honest_ones_changes_nothing(store):
-    honest = [report_of(n, REBUILT, vehicle=f"honest-{n}") for n in range(4)]
+    names = [f"honest-{n}" for n in range(4)]
+    honest = [report_of(n, measured_anew(name, REBUILT), vehicle=name) for n, name in enumerate(names)]
     put(store, *honest)
     merge_all(store)
     before = store.get("ndt", TILE).sha

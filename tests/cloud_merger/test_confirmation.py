@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from merger_world import GROUND, POLE, TILE, WALL, change_of, gaussians_of, report_of, sha_of
+from merger_world import GROUND, POLE, TILE, WALL, change_of, gaussians_of, report_of, seen_by, sha_of
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -258,7 +258,8 @@ def merge_all(store):
 
 
 def whole(number, changed, vehicle=""):
-    return report_of(number, change_of(EPOCH, sorted({*VOXELS, *changed}), changed), vehicle=vehicle)
+    told = seen_by(vehicle or f"car-{number}", changed)
+    return report_of(number, change_of(EPOCH, sorted({*VOXELS, *changed}), told), vehicle=vehicle)
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import signal
 
 import pytest
 from merger_processes import TAKEN, Cloud, wait_for
-from merger_world import GROUND, TILE, WALL, change_of, gaussians_of, report_of
+from merger_world import GROUND, TILE, WALL, change_of, gaussians_of, report_of, seen_by
 
 from gnd.gnd_map.tile import Tile
 
@@ -23,7 +23,7 @@ def cloud(tmp_path, free_port):
 
 
 def claims(number):
-    return report_of(number, change_of(EPOCH, list(VOXELS), THIRD))
+    return report_of(number, change_of(EPOCH, list(VOXELS), seen_by(f"car-{number}", THIRD)))
 
 
 @pytest.mark.slow

@@ -179,7 +179,8 @@ def test_parameters_come_back_from_their_text_and_say_when_they_cannot():
 def test_constants_travel_as_the_parameters_that_they_were(tmp_path):
     """Stores of releases in which they could be set are read: where one was set, it is named."""
     text = text_of(ShardConfig())
-    assert digest_of(text) == "7c6fc73dfd8249cad95a54d0618f78c07cd8510753651be66105ed8d01729278"
+    before = text.replace('"together":false,', "").replace('"copies":true,', "")  # 0166
+    assert digest_of(before) == "7c6fc73dfd8249cad95a54d0618f78c07cd8510753651be66105ed8d01729278"
     said = json.loads(text)
     assert said["shift"]["max_m"] == 1.0
     said["shift"]["max_m"] = 0.5

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-from merger_world import WALL, change_of, report_of
+from merger_world import WALL, change_of, report_of, seen_by
 from test_agreement import (
     BUILT,
     GONE,
@@ -48,7 +48,7 @@ def sees_the_truth(store: SqliteStore, number: int, vehicle: str) -> list[Change
         there = set(held.voxel_id.tolist())
         changes: dict[int, object] = {voxel: WALL for voxel in wall_of(tile) if voxel not in there}
         changes |= {voxel: None for voxel in new_of(tile) if voxel in there}
-        change = change_of(held, observed(tile), changes, tile=tile)  # type: ignore[arg-type]
+        change = change_of(held, observed(tile), seen_by(vehicle, changes), tile=tile)  # type: ignore[arg-type]
         found.append(at(number, report_of(100 * number + k, change, vehicle=vehicle)))
     return found
 

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from merger_world import BALL, GROUND, VOXEL_BY_VOXEL, WALL, change_of, gaussians_of, report_id, report_of, sha_of
+from merger_world import (
+    BALL,
+    GROUND,
+    VOXEL_BY_VOXEL,
+    WALL,
+    change_of,
+    gaussians_of,
+    report_id,
+    report_of,
+    seen_by,
+    sha_of,
+)
 from test_agreement import NOTHING, NS, TILES, at, base_of, new_of, observed, says, shas, take, wall_of
 from test_standing import a_store, little, of
 
@@ -102,10 +113,9 @@ def test_switched_off_a_window_is_the_same_with_and_without_it(seed: int) -> Non
         change = replace(change, unsure=gaussians_of(dict.fromkeys(unsure, BALL), 10, 10))
         times = {"first_ns": NS + k * 10**12, "last_ns": NS + k * 10**12, "received_ns": NS + k * 10**12}
         told[k % 2].append(Report(report_id(k), change, vehicle=f"car-{rng.integers(5)}", **times))
-    found = []
-    for strip in (lambda one: one, lambda one: replace(one, change=replace(one.change, unsure=Gaussians.empty()))):
-        found.append(_two_windows(epoch, told, strip, MergeParameters()))
-    assert found[0] == found[1]
+    made = (lambda one: one), (lambda one: replace(one, change=replace(one.change, unsure=Gaussians.empty())))
+    with_it, without = (_two_windows(epoch, told, strip, MergeParameters()) for strip in made)
+    assert with_it == without
 
 
 def _two_windows(
@@ -192,7 +202,7 @@ def test_what_others_confirm_vouches_for_what_was_only_met(store: SqliteStore) -
     claimed, rest = new_of(LAST)[:24], new_of(LAST)[24:]
     for number, name in enumerate("ab", 1):
         change = change_of(base_of(LAST), sorted(set(observed(LAST)) - set(rest)),
-                           dict.fromkeys(claimed, BALL), tile=LAST)  # fmt: skip
+                           seen_by(name, dict.fromkeys(claimed, BALL)), tile=LAST)  # fmt: skip
         change = replace(change, unsure=gaussians_of(dict.fromkeys(rest, BALL), 10, 10))
         take(store, [at(number, report_of(100 * number, change, vehicle=name))], merge=ON)
     assert new(store, LAST) == 48

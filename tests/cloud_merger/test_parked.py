@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zstandard
-from merger_world import TILE, change_of, gaussians_of, report_of
+from merger_world import TILE, change_of, gaussians_of, report_of, seen_by
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.confirmation import ConfirmationParameters
@@ -66,7 +66,7 @@ class Street:
         held = set(head.voxel_id.tolist())
         changed = {v: s for v, s in there.items() if v not in held}
         changed |= {v: None for v in held & {*CAR, *HOUSE} if v not in there}
-        change = change_of(head, SEEN, changed)
+        change = change_of(head, SEEN, seen_by(vehicle, changed))
         times = {"first_ns": self.now_ns - 10**9, "last_ns": self.now_ns}
         report = replace(report_of(self.number, change, vehicle=vehicle), sensor_model=sensor, **times)
         ((tile, body),) = split(report)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from merger_processes import TAKEN, Cloud, wait_for
-from merger_world import TILE, change_of, report_of
+from merger_world import TILE, change_of, measured_anew, report_of
 
 from gnd.cloud_merger import window
 from gnd.deploy.map_cli import map_group
@@ -41,7 +41,7 @@ def of_winter(number):
     changed = concat([change.put, nothing])
     changed = changed.take(np.argsort(changed.voxel_id))
     observed = np.union1d(SUMMER.voxel_id, WINTER.voxel_id).tolist()
-    return report_of(number, change_of(SUMMER, observed, changed))
+    return report_of(number, measured_anew(f"car-{number}", change_of(SUMMER, observed, changed)))
 
 
 def gnd_map(*arguments):

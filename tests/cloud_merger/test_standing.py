@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from merger_world import change_of, report_of
+from merger_world import change_of, report_of, seen_by
 from test_agreement import BUILT, GONE, NS, TILES, at, base_of, new_of, observed, shas, take, wall_of
 
 from gnd.cloud_merger.config import ShardConfig
@@ -43,7 +43,8 @@ def of(number: int, vehicle: str, changes: Changes) -> list[ChangeReport]:
     """A report of these tiles only."""
     made = []
     for k, (tile, changed) in enumerate(changes.items()):
-        change = change_of(base_of(tile), observed(tile), changed, tile=tile)  # type: ignore[arg-type]
+        told = seen_by(vehicle, changed)  # type: ignore[arg-type]
+        change = change_of(base_of(tile), observed(tile), told, tile=tile)
         made.append(at(number, report_of(100 * number + k, change, vehicle=vehicle)))
     return made
 

@@ -89,8 +89,9 @@ class DetectParameters:
     )
     together: bool = setting(
         False,
-        "Whether to tell the cloud what was met and not decided upon, which adds it up over vehicles. It helps on"
-        " motorways; where the map was made from few drives it publishes what they saw too little of.",
+        "Whether to tell the cloud what was met and not decided upon, which adds it up over vehicles with"
+        " `merge.together`. It helps on motorways; where the map was made from few drives it publishes what they saw"
+        " too little of.",
     )
     own_rules: DetectRules | None = None
 
