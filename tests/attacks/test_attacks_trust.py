@@ -359,7 +359,7 @@ def test_attack_counters_of_colluders(cloud: Cloud, number: int, colluders: str)
 def test_attack_counters_of_colluders_where_they_are_added_up(adding: Cloud, number: int, colluders: str) -> None:
     """The same where the cloud adds it up: two or three together are one witness, so they change what one vehicle is
     believed, eight voxels of a tile, and of a tile in which they tell of more nothing. When others have seen nothing in
-    three tiles, it is held against each of them: they change nothing any more, in a tile that nobody else sees neither.
+    three tiles, it is held against each of them: they change nothing any more, not even where nobody else looks.
     """
     street = Street(adding, number)
     lonely = street.tiles[3]
