@@ -89,8 +89,7 @@ def run_fleet(
         DeployError: a process cannot be kept alive, the port is taken, or the deadline has passed.
     """
     started_s = time.monotonic()
-    if prepared.repeats:  # of one recording two vehicles measure the same to the bit; here they are to confirm it
-        config = replace(config, merger=merged({"confirmation": {"copies": False}}, config.merger))
+    config = for_drives(config, prepared)
     site = site or loopback_site(config, len(prepared.agent_drives), prepared.identities)
     links = {vehicle_name(n): load_link(place.link) for n, place in enumerate(site.vehicles)}
     state = FleetState(links=links, ledgers=LiveLedgers(folder.root))
@@ -111,6 +110,13 @@ def run_fleet(
         run.wait_until(run.settled, SETTLE_S, "the merges did not settle")
         run.wait_until(run.watcher_caught_up, WATCHER_GRACE_S, None)
     return FleetOutcome(time.monotonic() - started_s, state.published, dict(supervisor.restarts))
+
+
+def for_drives(config: FleetConfig, prepared: PreparedRun) -> FleetConfig:
+    """The configuration, in which vehicles that drive the same recording confirm each other all the same."""
+    if not prepared.repeats:
+        return config
+    return replace(config, merger=merged({"confirmation": {"copies": False}}, config.merger))
 
 
 @contextmanager

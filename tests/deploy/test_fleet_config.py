@@ -1,11 +1,16 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from test_wrong_mounts import write_drive
 
 from gnd.deploy.errors import DeployError
-from gnd.deploy.fleet import shard_config
+from gnd.deploy.fleet import for_drives, shard_config
 from gnd.deploy.fleet_cli import by_part
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
+from gnd.deploy.prepare import prepare_recorded
+from gnd.deploy.run_folder import RunFolder
+from gnd.deploy.source import Source
 from gnd.gnd_map.errors import ConfigError, GndError
 
 
@@ -64,6 +69,20 @@ def test_layers_are_those_that_vehicles_detect_with_ndt_among_them() -> None:
     for layers, message in ((["signs"], "must hold 'ndt'"), (["ndt", "trees"], "trees"), (["ndt", "ndt"], "twice")):
         with pytest.raises(DeployError, match=message):
             load_fleet_config(None, {"layers": layers})
+
+
+@pytest.mark.parametrize(("agents", "believes"), [(None, False), (1, False), (2, True)])
+def test_vehicles_that_drive_one_recording_confirm_each_other(
+    tmp_path: Path, agents: int | None, believes: bool
+) -> None:
+    """What one drive gives twice is one witness's word elsewhere."""
+    drive = write_drive(tmp_path / "a.mcap")
+    config = FleetConfig(agents=agents or 1)
+    prepared = prepare_recorded(config, RunFolder(tmp_path / "run"), Source(drives=(drive,), agents=agents))
+    shard = shard_config(for_drives(config, prepared), "shard-0", Path("map.sqlite"), "tcp/127.0.0.1:7447")
+    assert shard.confirmation.copies is not believes
+    told = replace(config, merger={"confirmation": {"copies": True}})
+    assert shard_config(for_drives(told, prepared), "shard-0", Path("map.sqlite"), "").confirmation.copies
 
 
 def test_the_modes_are_settings_of_agents_and_shards() -> None:
