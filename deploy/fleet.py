@@ -31,6 +31,8 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.links import load_link
 from gnd.gnd_map.settings import from_settings, merged
 from gnd.schemas.keys import traffic_keys
+from gnd.tile_store.location import StoreLocation
+from gnd.tile_store.sql_inbox import HALVES_WAIT
 from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.vehicle_agent.agent import AgentConfig
 from gnd.vehicle_agent.settings import agent_of
@@ -107,7 +109,7 @@ def run_fleet(
         run.wait_until(run.watcher_ready, SETTLE_S, "the watcher did not start")
         waiting = Departures(supervisor, agent_processes(config, folder, prepared, site), folder, prepared.starts_s)
         run.wait_until(lambda: waiting.all_gone() and supervisor.finished("vehicle-"), config.deadline_s, LATE)
-        run.wait_until(run.settled, SETTLE_S, "the merges did not settle")
+        run.wait_until(run.settled, SETTLE_S + _longest_wait_s(config), "the merges did not settle")
         run.wait_until(run.watcher_caught_up, WATCHER_GRACE_S, None)
     return FleetOutcome(time.monotonic() - started_s, state.published, dict(supervisor.restarts))
 
@@ -204,11 +206,16 @@ def vehicle_name(number: int) -> str:
     return f"vehicle-{number:02d}"
 
 
-def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) -> ShardConfig:
+def shard_config(config: FleetConfig, shard_id: str, store: StoreLocation, connect: str) -> ShardConfig:
     """Return the configuration of one merger shard."""
     of_fleet = {**SHARD_DEFAULTS, "feature_layer": list(config.feature_layer)}
     own = {"shard_id": shard_id, "store_path": str(store), "connect": [connect]}
     return from_settings(ShardConfig, merged(of_fleet, config.merger, own), where="fleet: merger")
+
+
+def _longest_wait_s(config: FleetConfig) -> float:
+    """So long a tile may wait for the other half of a report before it is merged."""
+    return HALVES_WAIT * shard_config(config, "any", Path("any"), "tcp/localhost:1").store.merge_delay_s
 
 
 def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, place: VehicleSite) -> AgentConfig:

@@ -12,13 +12,13 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.router import run_router, wait_for_stop
 from gnd.gnd_map.region import Region
+from gnd.tile_store.location import StoreLocation, open_store
 from gnd.tile_store.server import TileServer
-from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.agent import AgentConfig, run_agent
 
 
 def of_cloud(
-    listen: str, connect: str, path: Path, shards: Sequence[ShardConfig], namespace: str | None = None
+    listen: str, connect: str, path: StoreLocation, shards: Sequence[ShardConfig], namespace: str | None = None
 ) -> list[ProcessSpec]:
     """The processes of a cloud in the order of their start: router, tile server, and a shard for each configuration.
 
@@ -41,10 +41,10 @@ def router(listen: str, *, stop: threading.Event) -> None:
     run_router((listen,), stop=stop)
 
 
-def store(path: Path, connect: str, *, stop: threading.Event) -> None:
+def store(path: StoreLocation, connect: str, *, stop: threading.Event) -> None:
     """Serve tiles and catalogs from the store."""
     with (
-        SqliteStore(path, create=False) as opened,
+        open_store(path, create=False) as opened,
         open_bus(BusConfig(connect=(connect,), patient=True), name="store") as bus,
         TileServer(opened, bus),
     ):

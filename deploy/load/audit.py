@@ -1,11 +1,13 @@
-"""What the store's file says of a load: read from its tables, not from what any program believes."""
+"""What the store says of a load: read from its tables, not from what any program believes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Protocol
 
 import apsw
+
+from gnd.tile_store.location import StoreLocation, conninfo_of, file_of
 
 NS_PER_S: Final = 1_000_000_000
 _BACKLOG: Final = (
@@ -89,16 +91,30 @@ class LoadLedger:
         return acknowledged - self.journaled - waiting
 
 
+class AuditConnection(Protocol):
+    """What is needed of a connection of either database."""
+
+    def execute(self, sql: str) -> Iterable[Any]:
+        """Its rows."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
 class Auditor:
-    """Reads a store's file beside the programs that use it.
+    """Reads a store beside the programs that use it.
 
     Args:
-        path: of the store.
+        location: of the store.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READONLY)
-        self._connection.set_busy_timeout(10_000)
+    def __init__(self, location: StoreLocation) -> None:
+        file = file_of(location)
+        if file is not None:
+            self._connection, self._snapshot = _of_file(file), "BEGIN"
+        else:
+            self._connection = _of_database(conninfo_of(location))
+            self._snapshot = "BEGIN ISOLATION LEVEL REPEATABLE READ, READ ONLY"
 
     def backlog(self, at_s: float) -> Backlog:
         """What waits now."""
@@ -107,7 +123,7 @@ class Auditor:
 
     def ledger(self) -> LoadLedger:
         """All that the load has left behind, as it is at one moment: workers may still be busy."""
-        self._connection.execute("BEGIN")  # one snapshot: an upload that is settled meanwhile would be seen nowhere
+        self._connection.execute(self._snapshot)  # an upload that is settled meanwhile would be seen nowhere
         try:
             return self._ledger()
         finally:
@@ -130,10 +146,22 @@ class Auditor:
         )
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the connection."""
         self._connection.close()
 
     def _row(self, sql: str) -> list[int]:
         """One row of counts; there is none of an empty table: 0."""
         (row,) = self._connection.execute(sql)
         return [int(value or 0) for value in row]
+
+
+def _of_file(path: Path) -> AuditConnection:
+    connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READONLY)
+    connection.set_busy_timeout(10_000)
+    return connection
+
+
+def _of_database(conninfo: str) -> AuditConnection:
+    import psycopg
+
+    return psycopg.connect(conninfo, autocommit=True)

@@ -20,6 +20,7 @@ from gnd.deploy.load.plan import LoadOptions
 from gnd.deploy.load.run import Tell, run_load
 from gnd.deploy.load.verdict import summary
 from gnd.extras import need_all
+from gnd.tile_store.location import LOCATION, StoreLocation
 
 PATH: Final = click.Path(path_type=Path)
 
@@ -55,11 +56,23 @@ PATH: Final = click.Path(path_type=Path)
 @click.option(
     "--drain", "drain_s", type=float, default=10.0, show_default=True, help="Seconds after which all must be merged."
 )
+@click.option(
+    "--store",
+    type=LOCATION,
+    help="An empty PostgreSQL database, which keeps what is written.  [default: a file, removed afterwards]",
+)
 @click.option("--keep", type=PATH, help="Empty folder in which store, logs and accounts are kept.")
 @click.option(
     "--json", "json_file", type=click.Path(path_type=Path, allow_dash=True), help="Write the figures; `-`: print them."
 )
-def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file: Path | None, **given: Any) -> None:
+def load(
+    drives: Path | None,
+    settled: Path | None,
+    store: StoreLocation | None,
+    keep: Path | None,
+    json_file: Path | None,
+    **given: Any,
+) -> None:
     """Replay the reports of a few drives as those of many vehicles on many streets, and measure the cloud.
 
     Router, tile server and merger shards run as processes of their own. Each street is a copy of the kept one at
@@ -72,7 +85,7 @@ def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file
     console = Console(stderr=True)
     runs = kept_runs(drives, settled, console)
     with ending_in_order() as stop, _folder(keep) as folder, _bar(console) as tell:
-        figures = summary(run_load(options, runs, folder, tell, stop))
+        figures = summary(run_load(options, runs, folder, tell, stop, store))
     if json_file is not None:
         with click.open_file(str(json_file), "w", encoding="utf-8") as file:
             file.write(json.dumps(figures, indent=2) + "\n")

@@ -1,8 +1,16 @@
 """CPU that processes have used."""
 
 from collections.abc import Mapping
+from typing import Final
 
 import psutil
+
+from gnd.tile_store.location import StoreLocation, conninfo_of, file_of
+
+DATABASE: Final = "database"
+"""Name of the part that is a database server's."""
+_HERE: Final = ("/", "localhost", "127.0.0.1", "::1")
+"""How hosts begin that are this machine; a path is a socket."""
 
 
 def cpu_s(pid: int) -> float:
@@ -25,17 +33,34 @@ def children(pid: int) -> list[int]:
 
 
 def by_part(pids: Mapping[str, int]) -> dict[str, float]:
-    """CPU seconds of the cloud's parts so far: router, store, shards (they receive) and their workers (they compute).
+    """CPU seconds of the cloud's parts so far: router, store, shards (they receive), their workers (they compute), and
+    the database server, if there is one.
 
     Args:
-        pids: of the processes by name, as the supervisor knows them.
+        pids: of the processes by name, as the supervisor knows them; `DATABASE` beside them.
     """
     shards = [pid for name, pid in pids.items() if name.startswith("merger-")]
     return {
         **{part: sum(cpu_s(pid) for name, pid in pids.items() if name == part) for part in ("router", "store")},
+        **{name: cpu_s(pid) for name, pid in pids.items() if name == DATABASE},
         "shards": sum(map(_own_s, shards)),  # a worker that has died is counted here
         "workers": sum(cpu_s(child) for pid in shards for child in children(pid)),
     }
+
+
+def server_of(location: StoreLocation) -> int | None:
+    """The first process of the database server of a store; None: the store is a file, or its server is elsewhere."""
+    if file_of(location) is not None:
+        return None
+    import psycopg
+
+    with psycopg.connect(conninfo_of(location)) as connection:
+        if not connection.info.host.startswith(_HERE):
+            return None
+        try:
+            return int(psutil.Process(connection.info.backend_pid).ppid())
+        except psutil.NoSuchProcess:  # it is in a container of its own
+            return None
 
 
 def _own_s(pid: int) -> float:

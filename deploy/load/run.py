@@ -12,12 +12,12 @@ from typing import Final
 
 from gnd.cloud_merger.checking import IngestLimits
 from gnd.deploy import roles
-from gnd.deploy.errors import DeployError
+from gnd.deploy.errors import DeployError, LoadError
 from gnd.deploy.fleet import shard_config
 from gnd.deploy.fleet_config import FleetConfig
 from gnd.deploy.load.audit import Auditor, Backlog
 from gnd.deploy.load.client import ClientConfig, client, read_accounts, start_file
-from gnd.deploy.load.cpu import busy_s, by_part
+from gnd.deploy.load.cpu import DATABASE, busy_s, by_part, server_of
 from gnd.deploy.load.drives import LAYER, KeptRuns
 from gnd.deploy.load.plan import LoadOptions, shared_out
 from gnd.deploy.load.sending import SenderAccount
@@ -29,7 +29,7 @@ from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.schemas.keys import parse_update_key, update_keys
 from gnd.schemas.updates import TileUpdate
-from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.location import StoreLocation, open_store, shown
 
 LOOK_S: Final = 0.5
 READY_S: Final = 120.0
@@ -47,23 +47,27 @@ class Running:
     """A cloud with its clients while they run.
 
     Attributes:
-        folder: of store, logs and accounts.
+        folder: of logs, accounts, and the store if it is a file.
+        store: where it is.
         supervisor: of all processes.
         connect: endpoint of the router.
         clients: what was started.
-        auditor: of the store's file.
+        auditor: of the store.
         notices_s: when each (tile, version) was heard of here, s UTC.
         backlog: what was waiting when.
         names: of the processes of the cloud.
+        server: first process of the database server; None: there is none on this machine.
     """
 
     folder: Path
+    store: StoreLocation
     supervisor: Supervisor
     connect: str
     clients: list[ClientConfig]
     auditor: Auditor
     stop: threading.Event
     names: tuple[str, ...]
+    server: int | None = None
     notices_s: dict[tuple[int, int], float] = field(default_factory=dict)
     backlog: list[Backlog] = field(default_factory=list)
 
@@ -82,7 +86,8 @@ class Running:
     def cloud_cpu_s(self) -> dict[str, float]:
         """CPU of the cloud's parts so far."""
         pids = self.supervisor.pids()
-        return by_part({name: pids[name] for name in self.names if name in pids})
+        of_database = {} if self.server is None else {DATABASE: self.server}
+        return by_part({name: pids[name] for name in self.names if name in pids} | of_database)
 
     def client_cpu_s(self) -> float:
         """CPU of the clients, which have ended."""
@@ -99,7 +104,14 @@ class Running:
         return True
 
 
-def run_load(options: LoadOptions, runs: KeptRuns, folder: Path, tell: Tell, stop: threading.Event) -> LoadOutcome:
+def run_load(
+    options: LoadOptions,
+    runs: KeptRuns,
+    folder: Path,
+    tell: Tell,
+    stop: threading.Event,
+    store: StoreLocation | None = None,
+) -> LoadOutcome:
     """Replay kept drives as many vehicles.
 
     Args:
@@ -108,23 +120,27 @@ def run_load(options: LoadOptions, runs: KeptRuns, folder: Path, tell: Tell, sto
         folder: empty; for store, logs and accounts.
         tell: is told how far it is.
         stop: ends the run early: what was measured until then is the outcome.
+        store: a new one, which keeps what is written; None: a file in the folder.
 
     Raises:
-        LoadError: the drives cannot be replayed.
+        LoadError: the drives cannot be replayed, or the store holds a map.
         DeployError: the cloud does not start, or does not stay alive.
     """
     streets = Streets.of(runs, options)
-    _put_streets(streets, folder / "store.sqlite", tell, stop)
+    location = folder / "store.sqlite" if store is None else store
+    _put_streets(streets, location, tell, stop)
     start_fork_server()
-    with _cloud(options, runs, folder, stop) as running:
+    with _cloud(options, runs, folder, location, stop) as running:
         tell("start", 0, 1)
         planned = _ready(running)
         return _measured(running, options, planned, tell)
 
 
-def _put_streets(streets: Streets, path: Path, tell: Tell, stop: threading.Event) -> None:
+def _put_streets(streets: Streets, location: StoreLocation, tell: Tell, stop: threading.Event) -> None:
     count = streets.options.streets
-    with SqliteStore(path) as store:
+    with open_store(location) as store:
+        if any(True for _ in store.heads(LAYER)):
+            raise LoadError(f"{shown(location)} holds a map; a load needs a store of its own")
         for street in range(count):
             if stop.is_set():
                 raise KeyboardInterrupt
@@ -133,9 +149,10 @@ def _put_streets(streets: Streets, path: Path, tell: Tell, stop: threading.Event
 
 
 @contextmanager
-def _cloud(options: LoadOptions, runs: KeptRuns, folder: Path, stop: threading.Event) -> Iterator[Running]:
+def _cloud(
+    options: LoadOptions, runs: KeptRuns, folder: Path, store: StoreLocation, stop: threading.Event
+) -> Iterator[Running]:
     connect = f"tcp/127.0.0.1:{claim_port(0)}"
-    store = folder / "store.sqlite"
     made = (shard_config(FleetConfig(), f"shard-{n}", store, connect) for n in range(options.shards))
     # streets lie districts apart, and vehicles that follow each other send the same drives
     shards = [
@@ -155,7 +172,8 @@ def _cloud(options: LoadOptions, runs: KeptRuns, folder: Path, stop: threading.E
         auditor = Auditor(store)
         stack.callback(auditor.close)
         bus = stack.enter_context(open_bus(BusConfig(connect=(connect,), open_timeout_s=READY_S), name="load"))
-        running = Running(folder, supervisor, connect, clients, auditor, stop, tuple(spec.name for spec in specs))
+        names = tuple(spec.name for spec in specs)
+        running = Running(folder, store, supervisor, connect, clients, auditor, stop, names, server_of(store))
         stack.enter_context(bus.subscribe(update_keys(LAYER), running.on_update))
         for one in clients:
             supervisor.start(ProcessSpec(_name(one), client, (one,), restart=False))
@@ -173,7 +191,7 @@ def _ready(running: Running) -> int:
         DeployError: that takes too long.
     """
     shards = sum(name.startswith("merger-") for name in running.names)
-    with SqliteStore(running.folder / "store.sqlite", create=False) as store:
+    with open_store(running.store, create=False) as store:
         until_s = time.monotonic() + READY_S
         is_ready = running.wait_until(
             lambda: (

@@ -11,22 +11,24 @@ import apsw
 import pytest
 from load_testing import make_run
 
+from gnd.deploy.errors import LoadError
 from gnd.deploy.load.client import start_file
 from gnd.deploy.load.cpu import children
 from gnd.deploy.load.drives import KeptRuns
 from gnd.deploy.load.plan import LoadOptions
 from gnd.deploy.load.run import run_load
 from gnd.deploy.load.verdict import summary
+from gnd.tile_store.location import open_store
 
 pytestmark = pytest.mark.xdist_group("fleets")
 
 OPTIONS = LoadOptions(vehicles=4, km=0.25, kmh=180.0, per_street=2, shards=1, clients=1, in_flight=8)
 
 
-def loaded(tmp_path, options):
+def loaded(tmp_path, options, store=None):
     run, folder = make_run(tmp_path / "run"), tmp_path / "load"
     folder.mkdir()
-    return run_load(options, KeptRuns(run), folder, lambda *_: None, threading.Event()), folder
+    return run_load(options, KeptRuns(run), folder, lambda *_: None, threading.Event(), store), folder
 
 
 @pytest.mark.slow
@@ -48,6 +50,24 @@ def test_a_cloud_keeps_up_with_a_few_vehicles(tmp_path):
     assert told["cpu_ms_per_report"] > 0
     assert {name for name, ms in told["cpu_ms_by_part"].items() if ms > 0} >= {"workers", "shards"}
     assert told["cpu_share"]["clients"] > 0
+
+
+@pytest.mark.slow
+def test_a_database_keeps_up_too_and_its_server_is_a_part_of_the_cost(tmp_path, new_database):
+    database = new_database()
+    outcome, folder = loaded(tmp_path, OPTIONS, database)
+    told = summary(outcome)
+    assert told["why_not"] == []
+    assert told["reports"] == told["acknowledged"] == outcome.planned > 25
+    assert told["lost"] == 0
+    assert not (folder / "store.sqlite").exists()
+    with open_store(database, create=False) as store:
+        journaled = {row.report_id for row in store.reports()}
+    assert {one.report_id for one in outcome.acknowledged} == journaled
+    assert told["cpu_ms_by_part"]["database"] > 0
+    (tmp_path / "again").mkdir()
+    with pytest.raises(LoadError, match="holds a map"):
+        loaded(tmp_path / "again", OPTIONS, database)
 
 
 def hang_workers(folder, after_s, for_s):
