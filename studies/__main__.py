@@ -12,7 +12,18 @@ import click
 from studies.frame.measure import machine, print_figures
 from studies.frame.options import click_options, options_of
 
-NAMES: Final = ("ingest", "poles", "stalled", "outage", "flooder", "herd", "dearest", "signatures", "identity-bytes")
+NAMES: Final = (
+    "ingest",
+    "poles",
+    "stalled",
+    "outage",
+    "flooder",
+    "herd",
+    "dearest",
+    "signatures",
+    "identity-bytes",
+    "many-tiles",
+)
 
 
 def main() -> None:

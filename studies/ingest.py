@@ -52,7 +52,7 @@ class SentUpload:
 def run() -> list[Figure]:
     """Measure acks of 100 clients, at the pace of a fleet and as fast as it goes, and what a report costs."""
     reports = corpus()
-    return [*_acks(reports, 1), *_acks(reports, 2), *_costs(reports)]
+    return [*_acks(reports, 1), *_acks(reports, 2), *costs(reports)]
 
 
 def from_many(reports: Sequence[CorpusReport], count: int, name: str) -> list[CorpusReport]:
@@ -106,7 +106,7 @@ def _one(bus: Bus, key: str, payload: bytes) -> tuple[float, bool]:
     return time.perf_counter() - start_s, status == "stored"
 
 
-def _costs(reports: Corpus) -> list[Figure]:
+def costs(reports: Corpus) -> list[Figure]:
     """CPU of this process for each report, to the ack and to the journal, without a bus."""
     warm_up()
     with tempfile.TemporaryDirectory() as folder, SqliteStore(Path(folder) / "store.sqlite") as store:

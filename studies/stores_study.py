@@ -21,6 +21,7 @@ from typing import Any
 import click
 import numpy as np
 
+from gnd.cloud_merger.work import SETTLED_TOGETHER
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
@@ -28,16 +29,19 @@ from gnd.schemas.report_id import deterministic_report_id
 from gnd.tile_store.location import open_store
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.uploads import Settled, Upload
-from gnd.tile_store.values import ReportRow
+from gnd.tile_store.values import Basis, Publication, ReportRow, StoreConfig
 
 THREADS = 32
 UPLOADS = 1000
 SETTLED = 90
 TILES_OF_REPORT = 8
 READ = 600
+PUBLISHED = 160
 BODY_BYTES = 865
 """Of a real short report, as `python -m studies ingest` sends them."""
 FIRST = TileId(497353963154)
+AT_ONCE = StoreConfig(merge_delay_s=0.0)
+"""Tiles can be claimed when their reports are journaled."""
 
 
 @click.command()
@@ -49,8 +53,8 @@ def main(database: str, server: int, rounds: int) -> None:
     found: dict[str, dict[str, list[Cost]]] = {}
     with (
         tempfile.TemporaryDirectory() as folder,
-        open_store(Path(folder) / "store.sqlite") as file,
-        open_store(database) as there,
+        open_store(Path(folder) / "store.sqlite", AT_ONCE) as file,
+        open_store(database, AT_ONCE) as there,
     ):
         for number in range(-1, rounds):  # the first warms both up
             for name, store in (("sqlite", file), ("postgresql", there))[:: 1 if number % 2 else -1]:
@@ -108,7 +112,30 @@ def _round(store: SqlStore, number: int, server: int) -> dict[str, Cost]:
     tiles = [TileId(FIRST.morton + n) for n in range(64)]
     store.put_tiles([_tile(tile) for tile in tiles])
     read = _cost(server, lambda n: store.get("ndt", tiles[n % 64]), range(READ), threads=4)
-    return {"uploads acknowledged": stored, "reports journaled": journaled, "tiles read": read}
+    groups = _publications(store, number)
+    published = _cost(server, store.publish, groups, threads=1)
+    return {
+        "uploads acknowledged": stored,
+        "reports journaled": journaled,
+        "tiles read": read,
+        f"{SETTLED_TOGETHER} tiles published together": published,
+    }
+
+
+def _publications(store: SqlStore, number: int) -> list[list[Publication]]:
+    """What a worker publishes at once, of the tiles about which reports were journaled."""
+    works = [store.load(claim) for claim in store.claim("study", PUBLISHED, 600.0)]
+    ready = [
+        Publication(
+            work.claim,
+            work.base_version,
+            _tile(work.claim.tile, 0.001 * (number + 1)),
+            report_ids=tuple(row.report_id for row in work.reports),
+            basis=Basis(work.journal.window, work.journal.seq),
+        )
+        for work in works
+    ]
+    return [ready[n : n + SETTLED_TOGETHER] for n in range(0, len(ready), SETTLED_TOGETHER)]
 
 
 def _rows(upload: Upload, rng: np.random.Generator) -> tuple[ReportRow, ...]:
@@ -119,10 +146,13 @@ def _rows(upload: Upload, rng: np.random.Generator) -> tuple[ReportRow, ...]:
     )
 
 
-def _tile(tile: TileId) -> Tile:
+def _tile(tile: TileId, height_m: float = 0.0) -> Tile:
     n = 400
     ids, many = np.arange(n, dtype=np.int32), np.full(n, 30, np.int32)
-    mean_m, cov_m2 = np.zeros((n, 3), np.float32), np.tile(np.array([0.01, 0, 0, 0.01, 0, 0.01], np.float32), (n, 1))
+    mean_m, cov_m2 = (
+        np.full((n, 3), height_m, np.float32),
+        np.tile(np.array([0.01, 0, 0, 0.01, 0, 0.01], np.float32), (n, 1)),
+    )
     return Tile(tile, 0, Gaussians(ids, many, many, mean_m, cov_m2))
 
 

@@ -1,0 +1,214 @@
+"""Loads for the model: `gnd load` on one core of its own, with a file and PostgreSQL, below and beyond the limit.
+
+    python -m studies.scale.measure --out studies/scale/loads.json --store postgresql://…/empty_database (as root)
+
+Every process of a load runs on the last core of the machine, with 64 times the weight of others (control group `cpu`),
+so that a machine that others use, too, measures what one core does. DATABASE is emptied before each run. Results are
+added to the file: a setting that is measured again stands beside its first time.
+"""
+
+import json
+import os
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import median
+from typing import Any, Final, Literal
+
+import click
+import numpy as np
+import psutil
+from rich.console import Console
+
+from gnd.deploy.load.cpu import server_of
+from gnd.deploy.load.drives import KeptRuns, KeptStreet
+from gnd.deploy.load.making import kept_runs
+from gnd.deploy.load.plan import LoadOptions
+from gnd.deploy.load.run import run_load
+from gnd.deploy.load.streets import Streets
+from gnd.deploy.load.verdict import LoadOutcome, summary
+from gnd.tile_store.location import StoreLocation, open_store
+from studies.frame.errors import OptionError
+from studies.ingest import costs
+from studies.scale.loads import MeasuredLoad, Setting
+from studies.short_corpus import corpus
+from studies.speed.__main__ import machine
+
+WEIGHT: Final = 64 * 1024
+GROUPS: Final = Path("/sys/fs/cgroup/cpu")
+SETTINGS: Final = (
+    # Three to fit the costs on; on one hardly anything is done ...
+    Setting("fit", vehicles=1, changed_share=1.0, kmh=15.0, km=0.2),
+    Setting("fit", vehicles=8, changed_share=0.0, km=0.8),
+    Setting("fit", vehicles=8, changed_share=1.0, km=0.8),
+    # ... and those that the model has to foretell.
+    Setting("compared", vehicles=4, changed_share=0.5, km=0.8),
+    Setting("compared", vehicles=14, changed_share=0.0, shards=1),
+    Setting("compared", vehicles=28, changed_share=1.0, shards=4),
+    Setting("compared", vehicles=40, changed_share=0.5),
+    # Measured when the model was finished.
+    Setting("unseen", vehicles=20, changed_share=0.0),
+    Setting("unseen", vehicles=34, changed_share=1.0),
+)
+DRAIN_S: Final = 120.0
+ROUNDS: Final = 3
+
+
+@click.command(help=__doc__)
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True)
+@click.option("--store", default="", help="A PostgreSQL database of its own; none: files only.")
+@click.option("--only", default="", help="Numbers of settings with commas between.  [default: all]")
+@click.option(
+    "--worker/--no-worker", default=False, help="Measure flags and second halves alone, as `python -m studies ingest`."
+)
+@click.option("--drives", type=click.Path(path_type=Path), help="As `gnd load` has it.")
+@click.option("--settled", type=click.Path(path_type=Path), help="As `gnd load` has it.")
+@click.option("--files/--no-files", default=True, help="Measure with files.")
+def main(
+    out: Path, store: str, only: str, drives: Path | None, settled: Path | None, *, worker: bool, files: bool
+) -> None:
+    """Measure all settings and add them to the file."""
+    numbers = [int(one) for one in only.split(",")] if only else range(len(SETTINGS))
+    console = Console(stderr=True)
+    runs = kept_runs(drives, settled, console)
+    told: dict[str, Any] = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {"loads": []}
+    told |= {"machine": machine(), "streets": _streets(Streets.of(runs, LoadOptions(changed_share=0.5)))}
+    with one_core() as core:
+        if worker:
+            told["worker"] = worker_costs()
+            out.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        for number in numbers:
+            for location in [None] * files + [store] * bool(store):
+                one = _measured(SETTINGS[number], location, runs)
+                told["loads"].append(asdict(one) | {"core": core, "load_average": os.getloadavg()[0]})
+                out.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+                console.print(one)
+
+
+def worker_costs() -> dict[str, float]:
+    """CPU from flags to the journal for a tile, and from Gaussians to the journal for a report, ms: medians."""
+    reports = corpus()
+    tiles = float(np.mean([len(one.whole.tiles) for one in reports.reports]))
+    rounds = [{one.name: one.value for one in costs(reports)} for _ in range(ROUNDS)]
+    flags, half = (median(one[f"CPU from {what} to the journal"] for one in rounds) for what in ("flags", "Gaussians"))
+    return {"flags_ms_a_tile": round(flags / tiles, 2), "half_ms": round(half, 2), "tiles_a_report": round(tiles, 1)}
+
+
+def _silent(_what: str, _done: float, _total: float) -> None:
+    """Nobody looks."""
+
+
+@contextmanager
+def one_core() -> Iterator[int]:
+    """This process and what it starts run on the last core, before all others; gives its number.
+
+    Raises:
+        OptionError: control groups (version 1) cannot be made here.
+    """
+    group = GROUPS / f"gnd-scale-{os.getpid()}"
+    core, before = max(os.sched_getaffinity(0)), os.sched_getaffinity(0)
+    try:
+        group.mkdir()
+    except OSError as error:
+        raise OptionError(f"no control group can be made: {error}; it takes root and {GROUPS}") from error
+    try:
+        (group / "cpu.shares").write_text(str(WEIGHT), encoding="ascii")
+        enter(os.getpid(), group, core)
+        yield core
+    finally:
+        for pid in (group / "cgroup.procs").read_text(encoding="ascii").split():
+            (GROUPS / "cgroup.procs").write_text(pid, encoding="ascii")
+        os.sched_setaffinity(0, before)
+        group.rmdir()
+
+
+def enter(pid: int, group: Path, core: int) -> None:
+    """A process and its threads enter a group and a core; what it starts afterwards follows."""
+    (group / "cgroup.procs").write_text(str(pid), encoding="ascii")
+    for thread in psutil.Process(pid).threads():
+        os.sched_setaffinity(thread.id, {core})
+
+
+def _measured(setting: Setting, store: StoreLocation | None, runs: KeptRuns) -> MeasuredLoad:
+    options = setting.options(DRAIN_S)
+    if store is not None:
+        _emptied(str(store))
+        group, core = GROUPS / f"gnd-scale-{os.getpid()}", max(os.sched_getaffinity(0))
+        server = psutil.Process(server_of(store))
+        for process in (server, *server.children()):
+            with suppress(ProcessLookupError, psutil.NoSuchProcess):  # a connection that has ended
+                enter(process.pid, group, core)
+    with tempfile.TemporaryDirectory() as folder:
+        outcome = run_load(options, runs, Path(folder), _silent, threading.Event(), store)
+        with open_store(Path(folder) / "store.sqlite" if store is None else store, create=False) as opened:
+            parts = Counter(row.part for row in opened.reports())
+    return measured_load(setting, "file" if store is None else "postgresql", outcome, parts)
+
+
+def measured_load(
+    setting: Setting, store: Literal["file", "postgresql"], outcome: LoadOutcome, parts: Mapping[int, int]
+) -> MeasuredLoad:
+    """The figures of a load that the model uses."""
+    told, merged = summary(outcome), outcome.ledger.merged
+    n = len(outcome.acknowledged)
+    if outcome.drained_s is None or told["lost"] or n < len(outcome.sent):
+        raise OptionError(f"{setting}: not all was merged: {told['why_not']}")
+    return MeasuredLoad(
+        setting=setting,
+        store=store,
+        at=f"{datetime.now(UTC):%Y-%m-%d}",
+        reports=n,
+        halves=told["second_halves"],
+        tiles_told=parts[0],
+        tiles_asked=parts[1],
+        versions=told["versions"],
+        parts_merged=len(merged),
+        offered_s=told["offered_s"],
+        drained_s=outcome.drained_s - outcome.start_s,
+        ack_ms=told["ack_ms"],
+        lag_s=told["merge_lag_s"],
+        cpu_s=dict(outcome.cpu_s),
+        client_cpu_s=outcome.client_cpu_s,
+    )
+
+
+def _emptied(url: str) -> None:
+    import psycopg
+
+    with psycopg.connect(url, autocommit=True) as connection:
+        connection.execute("DROP SCHEMA public CASCADE")
+        connection.execute("CREATE SCHEMA public")
+
+
+def _streets(streets: Streets) -> dict[str, Any]:
+    return {"changed": _street(streets.changed), "settled": _street(streets.settled)}
+
+
+def _street(street: KeptStreet) -> dict[str, Any]:
+    """Where along it each drive reports, and of which of its tiles nothing has changed."""
+    number = {
+        tile: n
+        for n, tile in enumerate(sorted({t.tile for d in street.drives for r in d.reports for t in r.whole.tiles}))
+    }
+    drives = [
+        [
+            {
+                "at_m": round(report.at_m, 1),
+                "tiles": [
+                    [number[one.tile], int(not len(one.changed) and not len(one.unsure))] for one in report.whole.tiles
+                ],
+            }
+            for report in drive.reports
+        ]
+        for drive in street.drives
+    ]
+    return {"length_m": round(street.length_m, 1), "tiles": len(street.tiles), "drives": drives}
+
+
+if __name__ == "__main__":
+    main()
