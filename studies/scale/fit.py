@@ -108,8 +108,8 @@ _MEDIANS: Final = ("ended_s", "merges", "versions", "busy_s")
 def fitted_stores(loads: Loads) -> dict[Kind, FittedStore]:
     """Costs of each kind of store, from the loads to fit on and what other commands measure.
 
-    Workers and receivers do the same whatever the store is, and their CPU is the same within 5 %, so their loads are
-    taken together. What workers use beyond flags and second halves are the merges: so much each, and so much for each
+    Workers and receivers do the same whatever the store is, and use nearly the same CPU, so their loads are taken
+    together. What workers use beyond flags and second halves are the merges: so much each, and so much for each
     pair of reports that a merge reads, by least squares over the loads; how many merges there are is the model's own
     count. How much of a merge comes after its publication is what brings the median lag of these loads nearest. A
     database adds its own CPU, to each cost the same share.

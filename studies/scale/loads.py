@@ -15,7 +15,7 @@ KINDS: tuple[Kind, ...] = ("file", "postgresql")
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class LoadSetting:
     """One load: what `gnd load` is told.
 
     Attributes:
@@ -61,7 +61,7 @@ class MeasuredLoad:
         core, load_average: where and when it was measured.
     """
 
-    setting: Setting
+    setting: LoadSetting
     store: Kind
     at: str
     reports: int
@@ -151,13 +151,13 @@ class Loads:
     def read(cls, text: str | None = None) -> "Loads":
         """From the JSON that `measure` writes; None: that which is committed."""
         told = json.loads(text or resources.files(__package__).joinpath("loads.json").read_text(encoding="utf-8"))
-        loads = tuple(MeasuredLoad(**one | {"setting": Setting(**one["setting"])}) for one in told["loads"])
+        loads = tuple(MeasuredLoad(**one | {"setting": LoadSetting(**one["setting"])}) for one in told["loads"])
         worker = WorkerCosts(**told["worker"])
         return cls(told["machine"], worker, loads, {name: _street(one) for name, one in told["streets"].items()})
 
     def of(self, store: Kind, use: str) -> list[MeasuredLoad]:
         """Those with a store that are to be fitted on, or compared: of each setting the medians of its runs."""
-        found: dict[Setting, list[MeasuredLoad]] = {}
+        found: dict[LoadSetting, list[MeasuredLoad]] = {}
         for one in self.loads:
             if one.store == store and one.setting.use == use:
                 found.setdefault(one.setting, []).append(one)

@@ -35,7 +35,7 @@ from gnd.deploy.load.verdict import LoadOutcome, summary
 from gnd.tile_store.location import StoreLocation, open_store
 from studies.frame.errors import OptionError
 from studies.ingest import costs
-from studies.scale.loads import MeasuredLoad, Setting
+from studies.scale.loads import LoadSetting, MeasuredLoad
 from studies.short_corpus import corpus
 from studies.speed.__main__ import machine
 
@@ -43,17 +43,17 @@ WEIGHT: Final = 64 * 1024
 GROUPS: Final = Path("/sys/fs/cgroup/cpu")
 SETTINGS: Final = (
     # Three to fit the costs on; on one hardly anything is done ...
-    Setting("fit", vehicles=1, changed_share=1.0, kmh=15.0, km=0.2),
-    Setting("fit", vehicles=8, changed_share=0.0, km=0.8),
-    Setting("fit", vehicles=8, changed_share=1.0, km=0.8),
+    LoadSetting("fit", vehicles=1, changed_share=1.0, kmh=15.0, km=0.2),
+    LoadSetting("fit", vehicles=8, changed_share=0.0, km=0.8),
+    LoadSetting("fit", vehicles=8, changed_share=1.0, km=0.8),
     # ... and those that the model has to foretell.
-    Setting("compared", vehicles=4, changed_share=0.5, km=0.8),
-    Setting("compared", vehicles=14, changed_share=0.0, shards=1),
-    Setting("compared", vehicles=28, changed_share=1.0, shards=4),
-    Setting("compared", vehicles=40, changed_share=0.5),
+    LoadSetting("compared", vehicles=4, changed_share=0.5, km=0.8),
+    LoadSetting("compared", vehicles=14, changed_share=0.0, shards=1),
+    LoadSetting("compared", vehicles=28, changed_share=1.0, shards=4),
+    LoadSetting("compared", vehicles=40, changed_share=0.5),
     # Measured when the model was finished.
-    Setting("unseen", vehicles=20, changed_share=0.0),
-    Setting("unseen", vehicles=34, changed_share=1.0),
+    LoadSetting("unseen", vehicles=20, changed_share=0.0),
+    LoadSetting("unseen", vehicles=34, changed_share=1.0),
 )
 DRAIN_S: Final = 120.0
 ROUNDS: Final = 3
@@ -134,7 +134,7 @@ def enter(pid: int, group: Path, core: int) -> None:
         os.sched_setaffinity(thread.id, {core})
 
 
-def _measured(setting: Setting, store: StoreLocation | None, runs: KeptRuns) -> MeasuredLoad:
+def _measured(setting: LoadSetting, store: StoreLocation | None, runs: KeptRuns) -> MeasuredLoad:
     options = setting.options(DRAIN_S)
     if store is not None:
         _emptied(str(store))
@@ -151,7 +151,7 @@ def _measured(setting: Setting, store: StoreLocation | None, runs: KeptRuns) -> 
 
 
 def measured_load(
-    setting: Setting, store: Literal["file", "postgresql"], outcome: LoadOutcome, parts: Mapping[int, int]
+    setting: LoadSetting, store: Literal["file", "postgresql"], outcome: LoadOutcome, parts: Mapping[int, int]
 ) -> MeasuredLoad:
     """The figures of a load that the model uses."""
     told, merged = summary(outcome), outcome.ledger.merged

@@ -80,7 +80,7 @@ class Prices:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ServedPlace:
     """Where vehicles drive."""
 
     name: str
@@ -95,7 +95,7 @@ class ScaleParameters:
     driving: DrivingHabits
     keeping: Keeping
     prices: Prices
-    place: tuple[Place, ...]
+    place: tuple[ServedPlace, ...]
 
     @classmethod
     def read(cls, path: Path | None = None) -> "ScaleParameters":
@@ -163,7 +163,7 @@ class PlannedPlace:
         money: a year, by part.
     """
 
-    place: Place
+    place: ServedPlace
     km_s: float
     on_road: float
     reports_s: float
@@ -184,7 +184,7 @@ class PlannedPlace:
     money: Mapping[str, float]
 
 
-def planned(place: Place, costs: CostsOfUse, given: ScaleParameters) -> PlannedPlace:
+def planned(place: ServedPlace, costs: CostsOfUse, given: ScaleParameters) -> PlannedPlace:
     """What a place takes."""
     driving, keeping = given.driving, given.keeping
     km_a_year = place.vehicles * driving.km_a_year
@@ -245,7 +245,7 @@ class ScaleLimit:
 
 def limits(costs: CostsOfUse, given: ScaleParameters) -> list[ScaleLimit]:
     """What breaks, the first first."""
-    keeping, unit = given.keeping, planned(Place("one", 1.0, 1.0), costs, given)
+    keeping, unit = given.keeping, planned(ServedPlace("one", 1.0, 1.0), costs, given)
     found = [
         ScaleLimit(
             "one host of 2 cores with its store in a file: CPU of reports",

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from studies.__main__ import NAMES, alone
 
-WITH_OPTIONS = {"poles": "--sensors", "flooder": "--kinds", "dearest": "--seconds"}
+WITH_OPTIONS = {"poles": "--sensors", "flooder": "--kinds", "dearest": "--seconds", "many-tiles": "--tiles"}
 
 
 @pytest.mark.parametrize("name", NAMES)

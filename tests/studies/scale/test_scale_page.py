@@ -12,7 +12,15 @@ from studies.scale.__main__ import PAGE
 from studies.scale.fit import fitted_stores
 from studies.scale.loads import Loads, MeasuredLoad
 from studies.scale.page import page
-from studies.scale.plan import CostsOfUse, MeasuredFigure, Place, ScaleParameters, limits, measured_figures, planned
+from studies.scale.plan import (
+    CostsOfUse,
+    MeasuredFigure,
+    ScaleParameters,
+    ServedPlace,
+    limits,
+    measured_figures,
+    planned,
+)
 
 USE = CostsOfUse(
     reports_a_km=2.0,
@@ -41,7 +49,9 @@ def test_a_place_is_reckoned_by_hand():
     driving = replace(given.driving, km_a_year=8766.0, peak_to_mean=3.6, speed_kmh=36.0, new_road_share=0.1)
     keeping = replace(given.keeping, use_of_a_core=0.5, journal_days=10.0, versions_kept=2.0, copies=2.0)
     prices = replace(given.prices, core_hour=0.1, object_gb_month=1.0, disk_gb_month=1.0, egress_gb=1.0)
-    one = planned(Place("here", 1000.0, 500.0), USE, replace(given, driving=driving, keeping=keeping, prices=prices))
+    one = planned(
+        ServedPlace("here", 1000.0, 500.0), USE, replace(given, driving=driving, keeping=keeping, prices=prices)
+    )
     assert one.km_s == pytest.approx(1.0)  # a thousand vehicles, a kilometre an hour each; 3.6 times that at the peak
     assert one.on_road == pytest.approx(100.0)
     assert (one.reports_s, one.merges_s) == (pytest.approx(2.0), pytest.approx(8.0))
@@ -58,14 +68,14 @@ def test_a_place_is_reckoned_by_hand():
 
 def test_twice_the_vehicles_take_twice_as_much_and_limits_come_in_their_order():
     given = ScaleParameters.read()
-    one, two = (planned(Place("here", vehicles, 500.0), USE, given) for vehicles in (1000.0, 2000.0))
+    one, two = (planned(ServedPlace("here", vehicles, 500.0), USE, given) for vehicles in (1000.0, 2000.0))
     assert two.shard_cores == pytest.approx(2 * one.shard_cores)
     assert two.bodies_gb == one.bodies_gb  # that is the road's
     found = limits(USE, given)
     assert [one.vehicles for one in found] == sorted(one.vehicles for one in found)
     for limit in found:
         if limit.what.startswith("one worker process"):
-            assert planned(Place("at it", limit.vehicles, 1.0), USE, given).shard_cores == pytest.approx(1.0)
+            assert planned(ServedPlace("at it", limit.vehicles, 1.0), USE, given).shard_cores == pytest.approx(1.0)
 
 
 def test_committed_figures_say_how_they_were_measured():
