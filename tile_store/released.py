@@ -2,7 +2,8 @@
 version that comes in between is not given away.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
 
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import CatalogEntry
@@ -10,6 +11,9 @@ from gnd.schemas.tiles_batch import TilesRequest
 from gnd.tile_store.store import Store
 from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.values import StoredTile
+
+READ_AT_ONCE: Final = 64
+"""Versions with their bodies, of a region that is sent whole."""
 
 
 def released_heads(store: Store, layer: str, prefix: str) -> list[CatalogEntry]:
@@ -24,6 +28,19 @@ def released(store: Store, layer: str, tile: TileId) -> StoredTile | None:
     stored = store.get(layer, tile)
     trial = store.trials(layer, tile.path).get(tile)
     return stored if trial is None else store.get(layer, tile, trial.base_version)
+
+
+def released_each(
+    store: Store, layer: str, tiles: Sequence[TileId], prefix: str
+) -> Iterator[tuple[TileId, StoredTile | None]]:
+    """The newest released versions of many tiles of a region, read some at a time; None: there is none."""
+    for first in range(0, len(tiles), READ_AT_ONCE):
+        some = tiles[first : first + READ_AT_ONCE]
+        newest = store.get_each(layer, some)
+        trials = store.trials(layer, prefix)
+        for tile, stored in zip(some, newest, strict=True):
+            trial = trials.get(tile)
+            yield tile, stored if trial is None else store.get(layer, tile, trial.base_version)
 
 
 def heads_for(

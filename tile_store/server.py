@@ -19,7 +19,7 @@ from gnd.schemas.tiles import Catalog, TileRequest
 from gnd.schemas.tiles_batch import TilesRequest
 from gnd.tile_store.answers import TileAnswers, reads_layer
 from gnd.tile_store.regions import TileRegion
-from gnd.tile_store.released import released, released_heads
+from gnd.tile_store.released import released, released_each, released_heads
 from gnd.tile_store.store import Store
 from gnd.tile_store.warm import warm_up
 
@@ -99,7 +99,7 @@ class TileServer:
                 f"region with {len(found)} tiles, more than {MOST_TILES_OF_REGION}: ask for its catalogs, then for its"
                 f" districts (asked for {request.key[:160]})"
             )
-        return self._region(found, wanted)
+        return self._region(found, region.prefix, wanted)
 
     def batch(self, request: Request) -> Answer:
         """Reply about several tiles of one district."""
@@ -136,9 +136,10 @@ class TileServer:
             raise NotMine
         return chain
 
-    def _region(self, found: list[tuple[str, TileId]], wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
-        for layer, tile in found:
-            yield keys.tile_key(layer, tile), self._answers.one(released(self._store, layer, tile), wanted).encode()
+    def _region(self, found: list[tuple[str, TileId]], prefix: str, wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
+        for layer, some in groupby(found, lambda one: one[0]):
+            for tile, stored in released_each(self._store, layer, [tile for _, tile in some], prefix):
+                yield keys.tile_key(layer, tile), self._answers.one(stored, wanted).encode()
 
     def _catalogs(self, region: TileRegion) -> Iterator[tuple[str, bytes]]:
         for (layer, district), _ in groupby(self._tiles(region), lambda found: (found[0], found[1].district)):

@@ -1,5 +1,6 @@
 """Tile versions in SQL: each function runs inside the caller's transaction."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from gnd.tile_store import sql_standing as standing
 from gnd.tile_store import sql_trials as trials
 from gnd.tile_store import sql_trust as trust
 from gnd.tile_store.bodies import lies_elsewhere
-from gnd.tile_store.connection import SqlConnection, change, fetch, post
+from gnd.tile_store.connection import Row, SqlConnection, change, fetch, post
 from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownReports, UnknownVersion
 from gnd.tile_store.provenance import NOTHING, Provenance, encode_provenance
 from gnd.tile_store.signing import Signing, check_signed, columns, sign_again
@@ -157,9 +158,19 @@ def rollback(c: SqlConnection, layer: str, tile: TileId, version: int, now: int,
 def stored(c: SqlConnection, statement: str, layer: str, tile: TileId, **values: int | bytes) -> StoredTile | None:
     """The version that one of the `stored_…` statements finds."""
     rows = fetch(c, statement, {"layer": layer, "tile": tile.morton, **values})
-    if not rows:
-        return None
-    name, morton, *told, signer, signed_s, signature = rows[0]
+    return _version_of(rows[0]) if rows else None
+
+
+def stored_heads(c: SqlConnection, layer: str, tiles: Sequence[TileId]) -> list[StoredTile | None]:
+    """The newest versions of some tiles, in their order; None: there is none."""
+    if not tiles:
+        return []
+    found = c.fetch_each("stored_head_of_many", [{"tile": tile.morton} for tile in tiles], {"layer": layer})
+    return [_version_of(rows[0]) if rows else None for rows in found]
+
+
+def _version_of(row: Row) -> StoredTile:
+    name, morton, *told, signer, signed_s, signature = row
     found = StoredTile(name, TileId(morton), *told)
     if signer is None:
         return found

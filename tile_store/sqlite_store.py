@@ -694,6 +694,12 @@ class SqlStore(ABC):
                 found = versions.stored(c, "stored_head", layer, tile)
         return self._whole(found)
 
+    def get_each(self, layer: str, tiles: Sequence[TileId]) -> list[StoredTile | None]:
+        """See `Store.get_each`."""
+        with self._readers.single() as c:
+            found = versions.stored_heads(c, layer, tiles)
+        return [self._whole(one) for one in found]
+
     def by_sha(self, layer: str, tile: TileId, sha: bytes) -> StoredTile | None:
         """See `Store.by_sha`."""
         with self._readers.single() as c:

@@ -329,6 +329,9 @@ class Store(Protocol):
     def get(self, layer: str, tile: TileId, version: int | None = None, at_ns: int | None = None) -> StoredTile | None:
         """A tile's newest version, or the one named, or the newest at a time; None: there is none."""
 
+    def get_each(self, layer: str, tiles: Sequence[TileId]) -> list[StoredTile | None]:
+        """The newest versions of some tiles, in their order, read at once; None: there is none."""
+
     def by_sha(self, layer: str, tile: TileId, sha: bytes) -> StoredTile | None:
         """The newest version of a tile with this content."""
 

@@ -355,3 +355,13 @@ def test_a_survey_goes_with_its_version(store: Store, maker: Maker) -> None:
         store.put_tiles([tile_of_voxels(TILE, k)], surveyed_ns=1_700_000_000_000_000_000)
     store.gc(1)
     assert maker.sql("SELECT version FROM survey") == [(4,)]
+
+
+def test_several_heads_are_read_as_one_by_one_in_the_order_asked_for(store: Store) -> None:
+    merged_versions(store, 2)
+    store.put_tiles([tile_of_voxels(FAR, 3)])
+    asked = [FAR, EAST, TILE, FAR]
+    assert store.get_each("ndt", asked) == [store.get("ndt", tile) for tile in asked]
+    assert store.get_each("ndt", asked)[1] is None
+    assert store.get_each("ndt", []) == store.get_each("other", []) == []
+    assert store.get_each("other", [TILE]) == [None]

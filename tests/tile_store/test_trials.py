@@ -9,6 +9,7 @@ from store_helpers import EAGER, TILE, report, tile_of_voxels
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.ticket import TICKETS, ticket_of
 from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
+from gnd.tile_store import released as released_tiles
 from gnd.tile_store import releasing
 from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.answers import TileAnswers
@@ -63,6 +64,17 @@ def test_a_version_on_trial_is_the_newest_and_not_released(store):
     assert released(store, "ndt", TILE).version == 1
     assert [(one.version, one.sha) for one in released_heads(store, "ndt", "")] == [(1, OLD.sha)]
     assert store.notices() == []
+
+
+def test_a_region_that_is_read_whole_has_the_version_before_it(store, monkeypatch):
+    monkeypatch.setattr(released_tiles, "READ_AT_ONCE", 2)
+    others = [TileId(TILE.morton + n) for n in range(1, 5)]
+    store.put_tiles([tile_of_voxels(tile, 1) for tile in others[1:]])
+    asked = [TILE, *others]
+    found = list(released_tiles.released_each(store, "ndt", asked, DISTRICT.path))
+    assert found == [(tile, released(store, "ndt", tile)) for tile in asked]
+    assert found[0][1] is not None
+    assert (found[0][1].sha, found[1][1]) == (OLD.sha, None)
 
 
 def test_vehicles_get_it_by_their_tickets_and_all_others_the_one_before(store):

@@ -546,6 +546,14 @@ FROM unnest(:layer::text[], :tile::bigint[], :report_id::text[], :part::bigint[]
     WHERE r.layer = w.layer AND r.tile = w.tile
   ) AS s (seq, vehicle)
 
+-- name: stored_head_of_many_each
+SELECT w.n, v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id,
+       v.body, s.surveyed_ns, v.signer, v.signed_s, v.signature
+FROM unnest(:tile::bigint[]) WITH ORDINALITY AS w (tile, n)
+  JOIN tile_head AS h ON h.layer = :layer AND h.tile = w.tile
+  JOIN tile_version AS v ON v.layer = h.layer AND v.tile = h.tile AND v.version = h.version
+  LEFT JOIN survey AS s ON s.layer = v.layer AND s.tile = v.tile AND s.version = v.version
+
 -- name: confirmed_version_each
 SELECT w.n, h.version
 FROM unnest(:layer::text[], :tile::bigint[], :base_sha::bytea[]) WITH ORDINALITY AS w (layer, tile, base_sha, n)

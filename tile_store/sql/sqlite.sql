@@ -711,6 +711,13 @@ FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
   LEFT JOIN survey AS s USING (layer, tile, version)
 WHERE h.layer = :layer AND h.tile = :tile
 
+-- name: stored_head_of_many
+SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body,
+       s.surveyed_ns, v.signer, v.signed_s, v.signature
+FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
+  LEFT JOIN survey AS s USING (layer, tile, version)
+WHERE h.layer = :layer AND h.tile = :tile
+
 -- name: stored_at
 SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, signer,
        signed_s, signature
