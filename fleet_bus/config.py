@@ -63,6 +63,11 @@ ROUTER_LEASE_MS: Final = 120_000
 """A router speaks to vehicles on mobile links: its keep-alives cost them as much as their own. A client notices a dead
 router by its own keep-alives, which nobody acknowledges, long before this (`WireMeter.transmit_timeout_ms`)."""
 _ROUTER_KEEP_ALIVES: Final = 2
+FAIL_OVER_MS: Final = 2_000
+"""A client with several routers gives a connection up on which nothing is acknowledged for so long."""
+_FAIL_OVER_OPEN_MS: Final = 2_000
+_FAIL_OVER_OPEN_DELAYS: Final = 40
+"""It tries each of its routers so long, or so many times the one-way delay of its link: a handshake with TLS is ten."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +76,7 @@ class BusConfig:
 
     Attributes:
         mode: "client" for everything but the router itself.
-        connect: endpoints of routers, tried in order; a client fails over to the next.
+        connect: endpoints of routers, tried in order; a client whose router is lost goes to the first that answers.
         listen: endpoints to open (routers only).
         link: profile of the vehicle's link, by name, file or value; "none" paces nothing.
         lease_ms: how long a silent session stays alive, ms; 0 takes the link's own, for a router `ROUTER_LEASE_MS`.
@@ -111,6 +116,12 @@ class BusConfig:
             raise BusConfigError("only a router gives rights")
         if self.lease_ms != 0 and self.lease_ms < 100:
             raise BusConfigError(f"lease_ms must be 100 or more (or 0: the link's own), got {self.lease_ms}")
+
+    @property
+    def transmit_timeout_ms(self) -> int:
+        """A connection ends on which nothing that was sent is acknowledged for so long, ms."""
+        lease_ms = self.lease_ms or self.link_profile.lease_ms
+        return min(lease_ms, FAIL_OVER_MS) if len(self.connect) > 1 else lease_ms
 
     @property
     def link_profile(self) -> LinkProfile:
@@ -272,6 +283,14 @@ def _rule(name: str, messages: list[str], keys: list[str], overwrite: dict[str, 
     return {"id": name, "messages": messages, "key_exprs": keys, "flows": ["ingress"], "overwrite": overwrite}
 
 
+def _open_timeout_ms(config: BusConfig, link: LinkProfile) -> int:
+    """How long one attempt to connect may take; with several routers the next is to have its turn soon."""
+    longest_ms = 10_000.0
+    if config.mode == "client" and len(config.connect) > 1:
+        longest_ms = min(longest_ms, max(_FAIL_OVER_OPEN_MS, _FAIL_OVER_OPEN_DELAYS * link.delay_ms))
+    return round(max(100.0, min(longest_ms, 1000 * config.open_timeout_s)))
+
+
 def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
     is_router = config.mode == "router"
     return {
@@ -293,7 +312,7 @@ def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/unicast/accept_pending": 1000,
         "transport/unicast/accept_timeout": ACCEPT_MS,
-        "transport/unicast/open_timeout": max(100, min(10_000, round(1000 * config.open_timeout_s))),
+        "transport/unicast/open_timeout": _open_timeout_ms(config, link),
         # Has no fragmentation.
         "transport/unicast/lowlatency": False,
         "transport/link/tx/lease": config.lease_ms or (ROUTER_LEASE_MS if is_router else link.lease_ms),

@@ -51,7 +51,7 @@ class Connection:
         self.closed = threading.Event()
         seals = config.identity is not None and config.mode == "client"  # a router only passes on
         self.sealing = Sealing.of_folder(config.identity) if seals and config.identity is not None else None
-        self.meter = WireMeter(config.lease_ms or config.link_profile.lease_ms)
+        self.meter = WireMeter(config.transmit_timeout_ms)
         self._pacer = Pacer(config.link_profile, self.closed)
         self._record_bytes = RECORD_BYTES if config.identity is not None and _is_tls(config.connect) else 0
         self._pid = os.getpid()

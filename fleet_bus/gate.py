@@ -8,6 +8,9 @@ member is cut off by its sockets; its listening ports are closed before, so that
 
 While two sessions link up, zenoh (1.10) may lose what a client declares at one of them: nobody at the other would ever
 reach it. So the new session listens only when its links have settled, and who connected shortly before connects anew.
+
+A router that is linked with others keeps these links in a session of their own, the trunk, which listens nowhere but at a
+Unix socket: a list that adds vehicles does not move them. A list that adds or revokes routers opens another trunk.
 """
 
 import contextlib
@@ -17,10 +20,10 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import zenoh
 
@@ -31,7 +34,9 @@ from gnd.fleet_bus.guard import USUAL_LIMITS, Address, ConnectionGuard, address
 from gnd.fleet_bus.identity.folder import MEMBERS, MemberIdentity
 from gnd.fleet_bus.identity.following import take_revoked
 from gnd.fleet_bus.identity.lists import MemberList, replace_file
+from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.identity.renewal import CertificateWatch
+from gnd.fleet_bus.router_links import LINK_OPEN_S, RouterLinks
 from gnd.fleet_bus.rights import AUTHORITY_KEYS, access_control
 from gnd.fleet_bus.sockets import Ends, address_of, cut, is_listening, stop_listening
 from gnd.fleet_bus.subscribing import OnMessage
@@ -46,6 +51,7 @@ FRESH_LOOKS: Final = 4
 """Who has come since so many looks may not have declared everything yet."""
 _TAKEN_OVER_S: Final = 5.0
 _POLL_S: Final = 0.01
+_ROUTER: Final = "router."
 _SAY_S: Final = 60.0
 _LOG = logging.getLogger(__name__)
 
@@ -74,6 +80,7 @@ class SecureRouter:
         self._changed = threading.Event()
         self._closed = threading.Event()
         self._generations: list[_Generation] = []
+        self._trunk: _Trunk | None = None
         self._number = 0
         self._heard: bytes | None = None
         self._refused = b""
@@ -85,6 +92,8 @@ class SecureRouter:
         try:
             self._check(self.certificate.identity)
             self.members = read_members(self.certificate.identity)
+            if self._connect:
+                self._open_trunk()
             self._open_generation()
         except BaseException:
             self.close()
@@ -107,8 +116,8 @@ class SecureRouter:
     def neighbours(self) -> list[str]:
         """What is connected right now, without the links between the sessions of this router."""
         with self._lock:
-            links = [link for one in self._generations for link in one.links()]
-        return ["router" if str(link.auth_identifier).startswith("router.") else "client" for link in links]
+            links = [link for one in self._sessions() for link in one.links()]
+        return ["router" if _is_router(link) else "client" for link in links]
 
     def _others(self) -> set[Address]:
         """The other sides of all sessions."""
@@ -125,6 +134,8 @@ class SecureRouter:
         with self._lock:
             while self._generations:
                 self._generations.pop().close()
+            if self._trunk is not None:
+                self._trunk.close()
         shutil.rmtree(self._sockets, ignore_errors=True)
 
     def take(self, data: bytes) -> bool:
@@ -150,7 +161,11 @@ class SecureRouter:
     def _catch_up(self) -> None:
         """Opens a session with the rights of now, unless the newest has them; tried again where it fails."""
         with self._lock:
-            if not self._closed.is_set() and self._generations[-1].names != self._names():
+            if self._closed.is_set():
+                return
+            if self._connect and (self._trunk is None or self._trunk.names != self._routers()):
+                self._open_trunk()
+            if self._generations[-1].names != self._names():
                 self._open_generation()
 
     def _names(self) -> frozenset[str]:
@@ -185,15 +200,19 @@ class SecureRouter:
             self._looks.append(self._clients())
 
     def _clients(self) -> set[Ends]:
-        return {_ends(link) for one in self._generations for link in one.links()}
+        links = (link for one in self._generations for link in one.links())
+        return {_ends(link) for link in links if not _is_router(link)}
+
+    def _sessions(self) -> "list[_Generation | _Trunk]":
+        return [*self._generations, *([] if self._trunk is None else [self._trunk])]
 
     def _cut_revoked(self) -> None:
         """Ends the connections of who does not belong, and of who came before its rights did: it comes again."""
         belong = {one.common_name for one in self.members.members}
         found: dict[str, Ends] = {}
-        for generation in self._generations:
-            known = belong & generation.names
-            links = ((str(link.auth_identifier), link) for link in generation.links())
+        for session in self._sessions():
+            known = belong & session.names
+            links = ((str(link.auth_identifier), link) for link in session.links())
             found |= {name: _ends(link) for name, link in links if name not in known}
         if found:
             cut(set(found.values()))
@@ -208,6 +227,19 @@ class SecureRouter:
             self._said_s = {name: at for name, at in self._said_s.items() if now_s - at < _SAY_S}
             self._said_s |= dict.fromkeys(new, now_s)
 
+    def _routers(self) -> frozenset[str]:
+        """Common names of the routers that have rights."""
+        return frozenset(name for name in self._names() if name.startswith(_ROUTER))
+
+    def _open_trunk(self) -> None:
+        """Links with the other routers, with the rights of now; the sessions of this router find the new trunk."""
+        if self._trunk is not None:
+            self._trunk.close()
+        socket = f"unixsock-stream/{self._sockets / 'trunk'}"
+        names = self._routers()
+        rights = access_control(map(MemberName.parse, names), links=True)
+        self._trunk = _Trunk(self._connect, socket, self._folder, rights, names)
+
     def _open_generation(self) -> None:
         """Opens a session with the rights of now; it takes over the ports, and the others keep their connections."""
         with self._lock:
@@ -217,10 +249,10 @@ class SecureRouter:
             config = BusConfig(
                 mode="router",
                 listen=(*self._listen, socket),
-                connect=(*self._connect, *(one.socket for one in self._generations)),
+                connect=tuple(one.socket for one in self._sessions()),
                 identity=self._folder,
                 rights=access_control(members, links=True),
-            )
+ )
             holds_ports = is_listening(self._ports)  # not after a revocation, nor at the start
             bus = open_bus(replace(config, takes_over=holds_ports), name="router")
             self._generations.append(_Generation(bus, socket, self._names(), self._on_list))
@@ -232,7 +264,8 @@ class SecureRouter:
         """Lets the newest session listen once it knows what the clients of all others have declared; who came while
         they linked up comes again.
         """
-        *others, new = self._generations
+        new = self._generations[-1]
+        others = [one for one in self._sessions() if one is not new]
         if not others:
             return
         if not _wait(lambda: new.routers() >= {one.router_id for one in others}):
@@ -299,6 +332,7 @@ class _Generation:
     def __init__(self, bus: Bus, socket: str, names: frozenset[str], on_list: OnMessage) -> None:
         self.bus, self.socket, self.names = bus, socket, names
         self.router_id = str(bus.connection.session.info.zid())
+        bus.keep(RouterLinks(bus))  # of routers that link with this one
         bus.subscribe(AUTHORITY_KEYS, on_list, kind="control")
 
     def routers(self) -> set[str]:
@@ -314,6 +348,34 @@ class _Generation:
         self.bus.close()
 
 
+class _Trunk:
+    """The session that links with other routers: it reaches them, and nobody reaches it but the sessions beside it."""
+
+    def __init__(
+        self, connect: Sequence[str], socket: str, folder: Path, rights: Mapping[str, Any], names: frozenset[str]
+    ) -> None:
+        self.socket, self.names = socket, names
+        config = BusConfig(
+            mode="router",
+            listen=(socket,),
+            connect=tuple(connect),
+            identity=folder,
+            rights=rights,
+            open_timeout_s=LINK_OPEN_S,
+        )
+        self.bus = open_bus(config, name="router")
+        self.router_id = str(self.bus.connection.session.info.zid())
+        self.bus.keep(RouterLinks(self.bus))
+
+    def links(self) -> list[zenoh.Link]:
+        """Its connections to other routers."""
+        return [link for link in self.bus.connection.session.info.links() if _is_ip(link)]
+
+    def close(self) -> None:
+        """Ends it."""
+        self.bus.close()
+
+
 def _wait(condition: Callable[[], bool]) -> bool:
     """Whether it came true in time."""
     deadline_s = time.monotonic() + _TAKEN_OVER_S
@@ -322,6 +384,10 @@ def _wait(condition: Callable[[], bool]) -> bool:
             return False
         time.sleep(_POLL_S)
     return True
+
+
+def _is_router(link: zenoh.Link) -> bool:
+    return str(link.auth_identifier).startswith(_ROUTER)
 
 
 def _is_ip(link: zenoh.Link) -> bool:

@@ -17,6 +17,7 @@ from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.guard import USUAL_LIMITS, Address, ConnectionGuard, GuardLimits, address
 from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.part import Part
+from gnd.fleet_bus.router_links import LINK_OPEN_S, RouterLinks
 
 if TYPE_CHECKING:  # a router without an identity loads nothing of it
     from gnd.fleet_bus.gate import SecureRouter
@@ -42,9 +43,10 @@ def open_router(
         BusConfigError: malformed endpoint.
     """
     _prepare()
-    config = BusConfig(mode="router", listen=tuple(listen), connect=tuple(connect))
+    config = BusConfig(mode="router", listen=tuple(listen), connect=tuple(connect), open_timeout_s=LINK_OPEN_S)
     bus = open_bus(config, name="router")
     bus.keep(_Guarding(bus, limits or USUAL_LIMITS))
+    bus.keep(RouterLinks(bus))
     return bus
 
 
