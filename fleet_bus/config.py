@@ -65,7 +65,7 @@ router by its own keep-alives, which nobody acknowledges, long before this (`Wir
 _ROUTER_KEEP_ALIVES: Final = 2
 FAIL_OVER_MS: Final = 2_000
 """A client with several routers gives a connection up on which nothing is acknowledged for so long."""
-_FAIL_OVER_OPEN_MS: Final = 2_000
+_FAIL_OVER_OPEN_MS: Final = 1_500
 _FAIL_OVER_OPEN_DELAYS: Final = 40
 """It tries each of its routers so long, or so many times the one-way delay of its link: a handshake with TLS is ten."""
 

@@ -9,8 +9,8 @@ member is cut off by its sockets; its listening ports are closed before, so that
 While two sessions link up, zenoh (1.10) may lose what a client declares at one of them: nobody at the other would ever
 reach it. So the new session listens only when its links have settled, and who connected shortly before connects anew.
 
-A router that is linked with others keeps these links in a session of their own, the trunk, which listens nowhere but at a
-Unix socket: a list that adds vehicles does not move them. A list that adds or revokes routers opens another trunk.
+A router that links with others does so in a session of its own, the trunk, which listens at a Unix socket alone: a list
+that adds vehicles leaves these links as they are. A list that adds or revokes routers opens another trunk.
 """
 
 import contextlib
@@ -36,8 +36,8 @@ from gnd.fleet_bus.identity.following import take_revoked
 from gnd.fleet_bus.identity.lists import MemberList, replace_file
 from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.identity.renewal import CertificateWatch
-from gnd.fleet_bus.router_links import LINK_OPEN_S, RouterLinks
 from gnd.fleet_bus.rights import AUTHORITY_KEYS, access_control
+from gnd.fleet_bus.router_links import LINK_OPEN_S, RouterLinks
 from gnd.fleet_bus.sockets import Ends, address_of, cut, is_listening, stop_listening
 from gnd.fleet_bus.subscribing import OnMessage
 
@@ -252,7 +252,7 @@ class SecureRouter:
                 connect=tuple(one.socket for one in self._sessions()),
                 identity=self._folder,
                 rights=access_control(members, links=True),
- )
+            )
             holds_ports = is_listening(self._ports)  # not after a revocation, nor at the start
             bus = open_bus(replace(config, takes_over=holds_ports), name="router")
             self._generations.append(_Generation(bus, socket, self._names(), self._on_list))

@@ -91,9 +91,10 @@ def scene(root: Path) -> Iterator[Scene]:
 
 
 @contextmanager
-def router_process(identity: Path, endpoint: str) -> Iterator["subprocess.Popen[str]"]:
-    """`gnd router` with an identity, listening."""
+def router_process(identity: Path, endpoint: str, *connect: str) -> Iterator["subprocess.Popen[str]"]:
+    """`gnd router` with an identity, listening, linked with those at `connect`."""
     command = [sys.executable, "-m", "gnd.deploy.cli", "router", "--listen", endpoint, "--identity", str(identity)]
+    command += [word for other in connect for word in ("--connect", other)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ))
     try:
         assert process.stdout is not None

@@ -131,12 +131,13 @@ def script(code: str, *arguments: str) -> Iterator[Script]:
 class RouterProcess:
     """`gnd router` as a process that can be killed and started again at the same endpoint."""
 
-    def __init__(self, endpoint: str) -> None:
-        self.endpoint = endpoint
+    def __init__(self, endpoint: str, connect: tuple[str, ...] = ()) -> None:
+        self.endpoint, self._connect = endpoint, connect
         self._running: Script | None = None
 
     def start(self) -> Script:
-        running = Script("from gnd.fleet_bus.cli import router; router()", "--listen", self.endpoint)
+        links = [word for other in self._connect for word in ("--connect", other)]
+        running = Script("from gnd.fleet_bus.cli import router; router()", "--listen", self.endpoint, *links)
         self._running = running
         running.wait_line("router listens")
         return running
