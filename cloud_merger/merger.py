@@ -14,7 +14,7 @@ from gnd.cloud_merger.expander_threads import working
 from gnd.cloud_merger.ingest import Ingest
 from gnd.cloud_merger.leases import Leases
 from gnd.cloud_merger.metrics import ShardMetrics
-from gnd.cloud_merger.ownership import KnownShards, Members, following
+from gnd.cloud_merger.ownership import KnownDistricts, KnownShards, Members, following
 from gnd.cloud_merger.reception import Reception
 from gnd.cloud_merger.release.collector import HealthCollector
 from gnd.cloud_merger.release.keeper import KEEP_EVERY_S, ReleaseKeeper
@@ -74,7 +74,7 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
             admission = Admission(store)
             # look at the outside, keep the bytes
             ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission)
-            members = Members(config.shard_id)
+            members = Members(config.shard_id, KnownDistricts(store))
             follow_revoked(bus)
             states.open()
             reception = Reception(bus, members, ingest.answer, store.release, KnownShards(store).has)
@@ -123,7 +123,7 @@ def run_worker(
             register_certificate(metrics.registry, bus.certificate)
             checks = {**store_checks(store, bus), **certificate_checks(bus.certificate)}
             stack.enter_context(HealthServer(port, metrics.registry, checks, host=host))
-        members, wake = following(bus, config.shard_id), threading.Event()
+        members, wake = following(bus, config.shard_id, KnownDistricts(store)), threading.Event()
 
         # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.
         bases = Bases(store)  # what one has decoded or made, the others need next

@@ -1,13 +1,17 @@
-"""Which shard answers for which district: rendezvous hashing over the shards that live.
+"""Which shard answers for which district: rendezvous hashing with bounded loads over the shards that live.
 
-Every member computes the same owner from the same members, without talking; when one goes, only its districts move.
-Ownership spreads the ingest and keeps caches warm. It protects nothing: that is the store's compare-and-swap.
+Every member computes the same owners from the same members and the districts of the map, without talking. Who has the
+highest hash of (member, district) gets the district, unless it has its share already. When a member goes, hardly more
+than its districts move. Districts that the map does not have yet go by the hash alone.
+Ownership spreads the ingest and keeps caches warm. It protects nothing: that is the store's compare-and-swap. So
+members may differ for some seconds in what they know: two acknowledge a report, or nobody does and it is sent again.
 """
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from hashlib import blake2b
 from typing import Final
 
@@ -19,6 +23,12 @@ from gnd.tile_store.store import Store
 
 ROLE: Final = "merger"
 LOOK_EVERY_S: Final = 1.0
+DISTRICTS_EVERY_S: Final = 5.0
+"""The districts of the map are read so often."""
+MOST_OF_MEAN: Final = 1.1
+"""A member gets at most so many times the mean of the districts, rounded down, but at least the mean, rounded up."""
+ENOUGH_FOR_HASHES: Final = 1000
+"""With more districts a member than these, hashes alone come as near: three standard deviations are a tenth."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -27,17 +37,60 @@ def owner_of(district: District, members: Collection[str]) -> str:
     return max(members, key=lambda member: (_score(member, district), member))
 
 
+def largest_share(districts: int, members: int) -> int:
+    """So many districts a member gets at most."""
+    mean = districts / members
+    return max(math.ceil(mean), math.floor(MOST_OF_MEAN * mean))
+
+
+def shared_out(districts: Collection[District], members: Collection[str]) -> dict[District, str]:
+    """Each district's owner, the same in every process; no member gets more than its share.
+
+    Pairs of member and district take their places in the order of their hashes, as long as the member has room: a
+    stable matching, of which little changes when a member or a district comes or goes.
+
+    Args:
+        districts: of the map.
+        members: names of those that live; not empty.
+    """
+    if len(districts) > ENOUGH_FOR_HASHES * len(members):
+        return {district: owner_of(district, members) for district in districts}
+    room = dict.fromkeys(members, largest_share(len(districts), len(members)))
+    pairs = [(_score(member, district), member, district.path, district) for district in districts for member in room]
+    owners: dict[District, str] = {}
+    for _, member, _, district in sorted(pairs, reverse=True):
+        if district not in owners and room[member]:
+            owners[district] = member
+            room[member] -= 1
+    return owners
+
+
 def _score(member: str, district: District) -> bytes:
     return blake2b(f"{member}\0{district.path}".encode(), digest_size=16).digest()
 
 
-class Members:
-    """The shards that live, as this shard sees them; itself always among them. Safe to use from any thread."""
+_NONE: Final[frozenset[District]] = frozenset()
 
-    def __init__(self, own: str) -> None:
+
+def no_districts() -> frozenset[District]:
+    """Of a map that nobody looks at: owners go by hashes alone."""
+    return _NONE
+
+
+class Members:
+    """The shards that live, as this shard sees them; itself always among them. Safe to use from any thread.
+
+    Args:
+        own: name of this shard.
+        districts: gives the districts of the map; the same object as long as they are the same.
+    """
+
+    def __init__(self, own: str, districts: Callable[[], frozenset[District]] = no_districts) -> None:
         self.own = own
+        self._districts = districts
         self._lock = threading.Lock()
         self._living = frozenset({own})
+        self._shared: tuple[frozenset[str], frozenset[District], dict[District, str]] = self._living, _NONE, {}
 
     @property
     def living(self) -> frozenset[str]:
@@ -53,7 +106,18 @@ class Members:
 
     def is_mine(self, district: District) -> bool:
         """Whether this shard owns the district among those that live."""
-        return owner_of(district, self._living) == self.own
+        living = self._living
+        return (self._owners(living).get(district) or owner_of(district, living)) == self.own
+
+    def _owners(self, living: frozenset[str]) -> dict[District, str]:
+        """Of the districts of the map; shared out again when members or districts have changed."""
+        districts = self._districts()
+        with self._lock:
+            of_living, of_districts, owners = self._shared
+            if living != of_living or districts is not of_districts:
+                owners = shared_out(districts, living)
+                self._shared = living, districts, owners
+            return owners
 
 
 class KnownShards:
@@ -79,9 +143,33 @@ class KnownShards:
             return name in self._living
 
 
-def following(bus: Bus, own: str) -> Members:
+class KnownDistricts:
+    """The districts of the map, as they were at most `DISTRICTS_EVERY_S` ago, or when the store last answered. Safe to
+    use from any thread.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._lock = threading.Lock()
+        self._districts: frozenset[District] = frozenset()
+        self._until_s = 0.0
+
+    def __call__(self) -> frozenset[District]:
+        """Those of now; the same object as long as they are the same."""
+        with self._lock:
+            if time.monotonic() >= self._until_s:
+                self._until_s = time.monotonic() + DISTRICTS_EVERY_S
+                try:
+                    found = self._store.districts()
+                    self._districts = self._districts if found == self._districts else found
+                except StoreError as error:
+                    _LOG.warning("cannot see which districts there are: %s", error)
+            return self._districts
+
+
+def following(bus: Bus, own: str, districts: Callable[[], frozenset[District]] = no_districts) -> Members:
     """The members as they come and go from now on, for who only wants to know whose a district is."""
-    members = Members(own)
+    members = Members(own, districts)
 
     def note(key: str, alive: bool) -> None:
         members.note(parse_alive_key(key)[1], alive=alive)

@@ -120,9 +120,12 @@ class Reception:
         return ack.encode()
 
     def look_again(self) -> None:
-        """Believe the tokens of shards that the store has come to know meanwhile, of none that it forgot."""
+        """Believe the tokens of shards that the store has come to know meanwhile, of none that it forgot; and give up
+        what districts that are new to the map have made another's.
+        """
         for member in sorted(self._tokens):
             self._note(member, alive=self._is_shard(member))
+        self._give_up_foreign()  # the map may have other districts now
 
     def _on_alive(self, key: str, alive: bool) -> None:
         try:

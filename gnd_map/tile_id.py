@@ -23,6 +23,7 @@ LON_TILES = 1 << 20
 LAT_TILES = 1 << 19
 TILE_RAD = 2.0 * np.pi / LON_TILES
 _DISTRICT_SHIFT = 10  # the last five base-4 digits
+TILES_OF_DISTRICT = 1 << _DISTRICT_SHIFT
 _PATH = re.compile(r"[01][0-3]{4}(/[0-3]{5}){3}")
 _DISTRICT_PATH = re.compile(r"[01][0-3]{4}(/[0-3]{5}){2}")
 _MAX_COVER = 1_000_000

@@ -37,7 +37,7 @@ class RouterLossOptions:
     """How much is measured."""
 
     kills: int = option(
-        5, "How often the region's router is killed, and how often its host goes silent.", span=(1, 600)
+        5, "How often the router is killed, and its host goes silent.", span=(1, 600)
     )
     apart_s: int = option(10, "How long the routers are apart, s.", span=(1, 600))
     link: str = option("none", "Link profile whose times the vehicle's session has; nothing is paced.")

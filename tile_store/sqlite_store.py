@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, Final, Protocol, Self, TypeVar
 
 from gnd.gnd_map.content import AnyTile
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District, TileId
 from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_store import clocks
 from gnd.tile_store import sql_accounts as accounts
@@ -665,7 +665,11 @@ class SqlStore(ABC):
         """See `Store.dirty_tiles`."""
         with self._readers.single() as c:
             rows = fetch(c, "dirty_tiles")
-        return [DirtyTile(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
+        now_ns = self._steady_ns()
+        return [
+            DirtyTile(layer, TileId(tile), *rest, overdue_s=max(now_ns - ready_ns, 0) / NS_PER_S)
+            for layer, tile, *rest, ready_ns in rows
+        ]
 
     # Trials
 
@@ -710,6 +714,13 @@ class SqlStore(ABC):
         """See `Store.layers`."""
         with self._readers.single() as c:
             return [layer for (layer,) in fetch(c, "layers")]
+
+    def districts(self) -> frozenset[District]:
+        """See `Store.districts`."""
+        with self._readers.snapshot() as c:
+            layers = [layer for (layer,) in fetch(c, "layers")]
+            found = {number for layer in layers for (number,) in fetch(c, "districts", {"layer": layer})}
+        return frozenset(TileId(number * TILES_OF_DISTRICT).district for number in found)
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """See `Store.heads`."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from gnd.gnd_map.content import AnyTile
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.tiles import CatalogEntry
 from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.trials import VersionTrial
@@ -337,6 +337,9 @@ class Store(Protocol):
 
     def layers(self) -> list[str]:
         """The layers that hold tiles."""
+
+    def districts(self) -> frozenset[District]:
+        """The districts in which any layer holds tiles."""
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """The newest versions of a region's tiles (a prefix of their path), sorted by tile."""

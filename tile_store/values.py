@@ -387,7 +387,7 @@ class TileWork:
 @dataclass(frozen=True, slots=True)
 class DirtyTile:
     """A tile that waits to be merged: reports that are not merged yet, how often it was tried; `is_leased`: a shard is
-    at it.
+    at it; `overdue_s`: for so long it has been ready, by the queue's clock.
     """
 
     layer: str
@@ -395,6 +395,7 @@ class DirtyTile:
     reports: int
     attempts: int
     is_leased: bool
+    overdue_s: float = field(default=0.0, compare=False)  # of now, not of the tile
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "is_leased", bool(self.is_leased))

@@ -23,6 +23,7 @@ from store_helpers import (
 from gnd.gnd_map.codec import LATTICES, best_codec, encode_gaussians, snap
 from gnd.gnd_map.day import UNKNOWN_DAY, day_of
 from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, TileId
 from gnd.schemas.errors import SchemaError, WrongHash
 from gnd.tile_store.errors import StoreError, UnknownVersion
 from gnd.tile_store.store import Store
@@ -365,3 +366,12 @@ def test_several_heads_are_read_as_one_by_one_in_the_order_asked_for(store: Stor
     assert store.get_each("ndt", asked)[1] is None
     assert store.get_each("ndt", []) == store.get_each("other", []) == []
     assert store.get_each("other", [TILE]) == [None]
+
+
+def test_districts_are_those_of_tiles_in_any_layer(store: Store) -> None:
+    assert store.districts() == frozenset()
+    begin = TILE.district.first_morton
+    first, last = TileId(begin + TILES_OF_DISTRICT), TileId(begin + 3 * TILES_OF_DISTRICT - 1)
+    store.put_tiles([tile_of_voxels(tile, 0) for tile in (first, TileId(first.morton + 1), last, FAR)])
+    assert store.districts() == {first.district, last.district, FAR.district}
+    assert store.districts() == {head.tile.district for head in store.heads()}

@@ -585,7 +585,7 @@ ORDER BY layer, tile, vehicle, reason
 SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change WHERE layer = :layer AND tile = :tile
 
 -- name: dirty_tiles
-SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty WHERE aside_ns IS NULL ORDER BY layer, tile
+SELECT layer, tile, waiting, attempts, owner IS NOT NULL, ready_ns FROM dirty WHERE aside_ns IS NULL ORDER BY layer, tile
 
 -- name: queued_tiles
 SELECT tile, COALESCE(aside_reason, 'is waiting to be merged') FROM dirty
@@ -735,6 +735,16 @@ SELECT tile, version, sha FROM tile_head WHERE layer = :layer AND tile >= :first
 
 -- name: layers
 SELECT DISTINCT layer FROM tile_head ORDER BY layer
+
+-- name: districts
+-- From the first tile of each district straight to the next district's: as many steps as districts, not as tiles.
+WITH RECURSIVE step (district) AS (
+  SELECT (SELECT MIN(tile) / 1024 FROM tile_head WHERE layer = :layer)
+  UNION ALL
+  SELECT (SELECT MIN(h.tile) / 1024 FROM tile_head AS h WHERE h.layer = :layer AND h.tile >= (district + 1) * 1024)
+  FROM step WHERE district IS NOT NULL
+)
+SELECT district FROM step WHERE district IS NOT NULL
 
 -- name: history
 SELECT version, parent, kind, created_ns, merger, n_reports, sha, size_bytes FROM tile_version
