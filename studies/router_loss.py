@@ -15,10 +15,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from gnd.deploy.lab.namespaces import add_namespace, remove_namespace, run_tool
+from gnd.deploy.ports import claim_port
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import PLAIN_VARIABLE, BusConfig
 from studies.frame.measure import Figure
@@ -36,9 +37,7 @@ Process = subprocess.Popen[str]
 class RouterLossOptions:
     """How much is measured."""
 
-    kills: int = option(
-        5, "How often the router is killed, and its host goes silent.", span=(1, 600)
-    )
+    kills: int = option(5, "How often the router is killed, and its host goes silent.", span=(1, 600))
     apart_s: int = option(10, "How long the routers are apart, s.", span=(1, 600))
     link: str = option("none", "Link profile whose times the vehicle's session has; nothing is paced.")
 
@@ -55,11 +54,12 @@ class RouterHosts:
 
     apart: bool
     vehicle: str = _VEHICLE
+    ports: tuple[int, int] = field(default_factory=lambda: (claim_port(0), claim_port(0)))
 
     def at(self, name: str) -> str:
         """The endpoint of a router."""
-        number = (_HUB, _REGION).index(name) + 1
-        return f"tcp/10.99.7.{number}:7447" if self.apart else f"tcp/127.0.0.1:{17_446 + number}"
+        number = (_HUB, _REGION).index(name)
+        return f"tcp/{f'10.99.7.{number + 1}' if self.apart else '127.0.0.1'}:{self.ports[number]}"
 
     def start(self, home: str, *words: str) -> Process:
         """A process of this program at home."""

@@ -667,8 +667,8 @@ class SqlStore(ABC):
             rows = fetch(c, "dirty_tiles")
         now_ns = self._steady_ns()
         return [
-            DirtyTile(layer, TileId(tile), *rest, overdue_s=max(now_ns - ready_ns, 0) / NS_PER_S)
-            for layer, tile, *rest, ready_ns in rows
+            DirtyTile(layer, TileId(tile), reports, attempts, is_leased, max(now_ns - ready_ns, 0) / NS_PER_S)
+            for layer, tile, reports, attempts, is_leased, ready_ns in rows
         ]
 
     # Trials
