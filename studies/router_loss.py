@@ -61,12 +61,13 @@ class RouterHosts:
         number = (_HUB, _REGION).index(name)
         return f"tcp/{f'10.99.7.{number + 1}' if self.apart else '127.0.0.1'}:{self.ports[number]}"
 
-    def start(self, home: str, *words: str) -> Process:
-        """A process of this program at home."""
+    def start(self, home: str, *words: str, is_read: bool = False) -> Process:
+        """A process of this program at home; whether somebody reads what it prints."""
         prefix = ["ip", "netns", "exec", home] if self.apart else []
         environment = os.environ | {PLAIN_VARIABLE: "1"}
+        out = subprocess.PIPE if is_read else subprocess.DEVNULL
         return subprocess.Popen(  # noqa: S603  (words of our own, no shell)
-            [*prefix, sys.executable, "-m", *words], env=environment, stdout=subprocess.PIPE, text=True
+            [*prefix, sys.executable, "-m", *words], env=environment, stdout=out, text=True
         )
 
 
@@ -80,10 +81,11 @@ class AskingVehicle:
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        for line in self._process.stdout:
-            answered_s = float(line)
-            self._longest_s = max(self._longest_s, answered_s - (self._last_s or answered_s))
-            self._last_s = answered_s
+        with self._process.stdout as lines:
+            for line in lines:
+                answered_s = float(line)
+                self._longest_s = max(self._longest_s, answered_s - (self._last_s or answered_s))
+                self._last_s = answered_s
 
     def longest_s(self, during: Callable[[], object]) -> float:
         """The longest time without an answer from when something happens until answers come again, s."""
@@ -152,15 +154,15 @@ def _parts(hosts: RouterHosts, options: RouterLossOptions, *routers: str) -> Ite
     router = ("gnd.deploy.cli", "router", "--listen")
     with ExitStack() as stack:
 
-        def start(home: str, *words: str) -> Process:
-            process = hosts.start(home, *words)
+        def start(home: str, *words: str, is_read: bool = False) -> Process:
+            process = hosts.start(home, *words, is_read=is_read)
             stack.callback(_end, process)
             return process
 
         start(_HUB, *router, hosts.at(_HUB))
         region = start(_REGION, *router, hosts.at(_REGION), "--connect", hosts.at(_HUB))
         start(_HUB, "studies.router_loss", "serve", "none", hosts.at(_HUB))
-        asking = start(hosts.vehicle, "studies.router_loss", "ask", options.link, *map(hosts.at, routers))
+        asking = start(hosts.vehicle, "studies.router_loss", "ask", options.link, *map(hosts.at, routers), is_read=True)
         yield AskingVehicle(asking), region
 
 

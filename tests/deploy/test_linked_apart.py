@@ -62,7 +62,7 @@ class Side:
         assert process.stdout is not None
         with process.stdout:
             for line in process.stdout:
-                lines.append((time.monotonic(), line.strip()))  # one by one: others read meanwhile
+                lines.append((time.monotonic(), line.strip()))  # noqa: PERF401  (others read meanwhile)
 
     def close(self) -> None:
         for process in self._processes:
