@@ -3,6 +3,7 @@
 import logging
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -17,6 +18,7 @@ from gnd.fleet_bus.settings_file import load_settings
 from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import settings_text
 from gnd.tile_store.location import shown
+from gnd.tile_store.moving import run_following
 
 
 @click.command()
@@ -25,6 +27,7 @@ from gnd.tile_store.location import shown
     "--store", "store_path", help="The store that the shards share, a file or a PostgreSQL URL.  [default: map.sqlite]"
 )
 @click.option("--connect", multiple=True, help="Endpoint of a router, tcp/host:port; may be repeated.")
+@click.option("--follow", is_flag=True, help="When the store moves (`gnd store copy`), go on with the new one.")
 @click.option("--mode", type=click.Choice(get_args(Mode)), help="How votes are counted.  [default: default]")
 @settings_options
 @metrics_options
@@ -33,6 +36,7 @@ def merger(
     shard_id: str | None,
     store_path: str | None,
     connect: tuple[str, ...],
+    follow: bool,
     mode: str | None,
     config_file: Path | None,
     changes: tuple[str, ...],
@@ -56,4 +60,10 @@ def merger(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     click.echo(f"merger {config.shard_id}: store {shown(config.store_path)}, mode {config.merge.mode}", err=True)
-    run_shard(config, stop, None if metrics_port is None else (metrics_host, metrics_port))
+    metrics_at = None if metrics_port is None else (metrics_host, metrics_port)
+    if not follow:
+        run_shard(config, stop, metrics_at)
+        return
+    run_following(
+        config.store_path, lambda at, ended: run_shard(replace(config, store_path=at), ended, metrics_at), stop
+    )

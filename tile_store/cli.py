@@ -5,7 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from types import FrameType
@@ -33,6 +33,7 @@ from gnd.tile_store.copy_cli import copy
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.location import LOCATION, StoreLocation, file_of, open_store, shown
 from gnd.tile_store.metrics import StoreCollector, store_checks
+from gnd.tile_store.moving import run_following
 from gnd.tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.signing import Signing
@@ -65,6 +66,7 @@ class TileServerConfig:
 @click.group(invoke_without_command=True)
 @click.option("--path", type=LOCATION, help="The store, a file or a PostgreSQL URL; `gnd map build` makes one.")
 @click.option("--connect", multiple=True, help=f"Endpoint of a router; repeatable.  [default: {DEFAULT_ENDPOINT}]")
+@click.option("--follow", is_flag=True, help="When the store moves (`gnd store copy`), go on with the new one.")
 @click.option("--workers", type=int, help="Threads that answer, 1 to 64.  [default: 4]")
 @settings_options
 @metrics_options
@@ -74,6 +76,7 @@ def store(
     context: click.Context,
     path: StoreLocation | None,
     connect: tuple[str, ...],
+    follow: bool,
     workers: int | None,
     config_file: Path | None,
     changes: tuple[str, ...],
@@ -96,6 +99,20 @@ def store(
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
+    metrics_at = None if metrics_port is None else (metrics_host, metrics_port)
+
+    def serve(location: StoreLocation, ended: threading.Event) -> None:
+        _serve(replace(server, path=location), metrics_at, ended)
+
+    if follow:
+        run_following(server.path, serve, stop)
+    else:
+        serve(server.path, stop)
+    click.echo("tile server ended")
+
+
+def _serve(server: TileServerConfig, metrics_at: tuple[str, int] | None, stop: threading.Event) -> None:
+    """Answer from a store until the event is set."""
     config = BusConfig(connect=server.connect, patient=True)
     with (
         existing(server.path) as opened,
@@ -104,18 +121,17 @@ def store(
         ExitStack() as stack,
     ):
         follow_revoked(bus)
-        if metrics_port is not None:
+        if metrics_at is not None:
             registry = CollectorRegistry()
             registry.register(StoreCollector(opened))
             register_certificate(registry, bus.certificate)
             checks = {**store_checks(opened, bus), **certificate_checks(bus.certificate)}
-            stack.enter_context(HealthServer(metrics_port, registry, checks, host=metrics_host))
+            stack.enter_context(HealthServer(metrics_at[1], registry, checks, host=metrics_at[0]))
         counts = opened.counts()
         click.echo(
             f"tile server: {counts.tiles} tiles of {opened.location} at {', '.join(server.connect)}; Ctrl-C ends it"
         )
         wait_for_stop(stop)
-    click.echo("tile server ended")
 
 
 store.add_command(copy)

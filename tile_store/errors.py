@@ -29,11 +29,15 @@ class StoreDamaged(StoreUnavailable):
 
 
 class StoreMoved(StoreUnavailable):
-    """The store was copied to another database, which is to be used instead."""
+    """The store was copied to another database, which is to be used instead.
+
+    Attributes:
+        target: where that is.
+    """
 
     def __init__(self, location: str, line: str) -> None:
-        target = line.partition("moved to ")[2].split(" CONTEXT:")[0].strip()
-        super().__init__(f"{location}: moved to {target}; nothing was written, start this with that store")
+        self.target = line.partition("moved to ")[2].split(" CONTEXT:")[0].strip()
+        super().__init__(f"{location}: moved to {self.target}; nothing was written, start this with that store")
 
 
 def odd_row(location: str, error: Exception) -> StoreDamaged:

@@ -36,6 +36,11 @@ def conninfo_of(location: StoreLocation) -> str:
     return told if told.startswith(_URLS) else told.removeprefix(_WORDS)
 
 
+def named(conninfo: str) -> str:
+    """The location of what libpq takes, without the password."""
+    return shown(conninfo if conninfo.startswith(_URLS) else f"{_WORDS}{conninfo}")
+
+
 def shown(location: StoreLocation) -> str:
     """A location for messages, without the password."""
     return _SECRET.sub("", str(location))

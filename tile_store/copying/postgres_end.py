@@ -6,8 +6,9 @@ from typing import Any, Final
 from gnd.tile_store.copying.contents import ALL, FENCED, Contents, Row
 from gnd.tile_store.copying.ends import EVENTS, LOG, MARK, NOTE, REFUSE, End
 from gnd.tile_store.errors import StoreUnavailable
+from gnd.tile_store.location import named
 from gnd.tile_store.migrations import SCHEMA_VERSION
-from gnd.tile_store.postgres_connection import MOVED_STATE, DatabaseClock, connect, shown
+from gnd.tile_store.postgres_connection import MOVED_STATE, DatabaseClock, connect
 from gnd.tile_store.postgres_store import PROGRAM, PostgresStore
 from gnd.tile_store.postgres_writer import LOCKS
 
@@ -33,7 +34,7 @@ class PostgresEnd(End):
     mark = "%s"
 
     def __init__(self, conninfo: str, *, is_target: bool) -> None:
-        super().__init__(shown(conninfo))
+        super().__init__(named(conninfo))
         connection = connect(conninfo, DatabaseClock())
         self._raw = connection.raw
         found = self._schema()

@@ -27,7 +27,7 @@ class SqliteEnd(End):
     mark = "?"
 
     def __init__(self, path: Path, *, is_target: bool) -> None:
-        super().__init__(str(path))
+        super().__init__(str(path.absolute()))  # who follows may be in another folder
         self._wanted = path
         is_new = is_target and not path.exists()
         self._path = path.with_name(f"{path.name}.copying") if is_new else path

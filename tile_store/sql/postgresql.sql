@@ -515,6 +515,9 @@ SELECT 1
 -- name: feature_source_exists
 SELECT 1
 
+-- name: is_fenced
+SELECT 1 FROM pg_trigger WHERE tgname = 'moved_away' AND tgrelid = to_regclass('shard')
+
 -- name: size_of_database
 SELECT pg_database_size(current_database())
 

@@ -1119,6 +1119,10 @@ SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COALESCE(MAX(arrival), 0) FROM 
        (SELECT COUNT(*) FROM report INDEXED BY report_waiting WHERE merged_in IS NULL),
        (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL), (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NOT NULL)
 
+-- name: is_fenced
+-- Whether every write is refused because the store has moved (`copying.ends.REFUSE`).
+SELECT 1 FROM sqlite_schema WHERE type = 'trigger' AND name = 'moved_away_insert_shard'
+
 -- name: touch
 UPDATE quarantine_size SET messages = messages
 
