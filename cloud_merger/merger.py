@@ -33,6 +33,7 @@ from gnd.fleet_bus.refusals import RefusalsTold, show_refusals
 from gnd.tile_store.errors import StoreClosed, StoreError
 from gnd.tile_store.location import open_store
 from gnd.tile_store.metrics import store_checks
+from gnd.tile_store.moving import moved_to
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.values import Claim
 
@@ -87,6 +88,8 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
                 if worker.has_ended():
                     store.release(config.shard_id)  # what it had in hand need not wait for the ends of its leases
                     worker.restart()
+            if moved_to(store) is not None:
+                worker.give_up()
         store.release(config.shard_id)
 
 

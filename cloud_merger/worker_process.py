@@ -83,6 +83,10 @@ class WorkerProcess:
         _LOG.error("the worker has ended with status %s; it is started again", self._process.returncode)
         self._process = self._start()
 
+    def give_up(self) -> None:
+        """End the worker at once: its store refuses all that it could still write."""
+        self._process.kill()
+
     def close(self) -> None:
         """End the worker: in order, or by force where that takes too long."""
         with contextlib.suppress(OSError):

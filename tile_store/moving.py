@@ -3,6 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from gnd.tile_store.connection import change, fetch
@@ -37,9 +38,7 @@ def run_following(location: StoreLocation, run: Run, stop: threading.Event) -> N
                 watch.close()
         if watch.target is None:
             return
-        _LOG.warning("%s has moved to %s: going on there", shown(location), watch.target)
-        location = watch.target
-        _wait_for(location, stop)
+        location = _where_to_go_on(location, watch.target, stop)
 
 
 class _Watch:
@@ -76,16 +75,22 @@ def moved_to(store: SqlStore) -> str | None:
     return None
 
 
-def _wait_for(location: StoreLocation, stop: threading.Event) -> None:
-    """Until a store is whole: it cannot be opened before."""
+def _where_to_go_on(old: StoreLocation, new: StoreLocation, stop: threading.Event) -> StoreLocation:
+    """Waits until the new store is whole, as it cannot be opened before; the old one where the move was abandoned."""
     told = ""
     while not stop.is_set():
         try:
-            open_store(location, create=False).close()
+            open_store(new, create=False).close()
         except StoreError as error:
             if str(error) != told:
                 told = str(error)
                 _LOG.warning("waiting for the store: %s", error)
-            stop.wait(LOOK_S / 4)
         else:
-            return
+            _LOG.warning("%s has moved to %s: going on there", shown(old), shown(new))
+            return new
+        with suppress(StoreError), open_store(old, create=False) as store:
+            if moved_to(store) is None:
+                _LOG.warning("%s is used again: going on there", shown(old))
+                return old
+        stop.wait(LOOK_S / 4)
+    return old

@@ -14,6 +14,8 @@ from merger_world import GROUND, POLE, TILE, change_of, gaussians_of, report_of,
 from gnd.gnd_map.codec import CODEC_FLOAT32
 from gnd.schemas.keys import tile_key
 from gnd.schemas.tiles import TileReply, TileRequest
+from gnd.tile_store.copying.sqlite_end import SqliteEnd
+from gnd.tile_store.errors import StoreError
 from gnd.tile_store.location import open_store
 from gnd.tile_store.moving import moved_to, run_following
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -123,3 +125,32 @@ def test_who_starts_with_a_store_that_has_moved_goes_to_the_new_one(tmp_path):
 
     run_following(old, run, stop)
     assert worked_on == [str(new)]
+
+
+def test_who_waits_for_a_move_that_is_abandoned_goes_on_with_the_old_store(tmp_path):
+    """The fence of a copy whose process was killed before the new store was whole."""
+    old, new = tmp_path / "old.sqlite", tmp_path / "new.sqlite"
+    SqliteStore(old).close()
+    end = SqliteEnd(old, is_target=False)
+    with end.transaction(alone=True):
+        end.refuse(str(new))
+    worked_on, stop = [], threading.Event()
+
+    def run(location, _ended):
+        worked_on.append(location)
+        stop.set()
+
+    following = threading.Thread(target=run_following, args=(old, run, stop))
+    following.start()
+    time.sleep(1.0)
+    assert worked_on == []
+    with end.transaction(alone=True):
+        end.allow()
+    following.join(30)
+    end.close()
+    assert worked_on == [old]
+
+
+def test_without_a_store_there_is_nothing_to_follow(tmp_path):
+    with pytest.raises(StoreError, match=r"nothing\.sqlite"):
+        run_following(tmp_path / "nothing.sqlite", lambda _at, _ended: None, threading.Event())
