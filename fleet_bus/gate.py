@@ -163,10 +163,16 @@ class SecureRouter:
         with self._lock:
             if self._closed.is_set():
                 return
-            if self._connect and (self._trunk is None or self._trunk.names != self._routers()):
+            gone = None
+            if self._trunk is not None and self._trunk.names != self._routers():
+                gone = self._trunk
                 self._open_trunk()
-            if self._generations[-1].names != self._names():
-                self._open_generation()
+            try:
+                if self._generations[-1].names != self._names():
+                    self._open_generation()
+            finally:
+                if gone is not None:  # last: sessions that lose a link while others link up may not find each other
+                    gone.close()
 
     def _names(self) -> frozenset[str]:
         """Common names of all that have rights: this router, too."""
@@ -232,10 +238,9 @@ class SecureRouter:
         return frozenset(name for name in self._names() if name.startswith(_ROUTER))
 
     def _open_trunk(self) -> None:
-        """Links with the other routers, with the rights of now; the sessions of this router find the new trunk."""
-        if self._trunk is not None:
-            self._trunk.close()
-        socket = f"unixsock-stream/{self._sockets / 'trunk'}"
+        """Links with the other routers, with the rights of now; the next session of this router links with it."""
+        self._number += 1
+        socket = f"unixsock-stream/{self._sockets / f'trunk-{self._number}'}"
         names = self._routers()
         rights = access_control(map(MemberName.parse, names), links=True)
         self._trunk = _Trunk(self._connect, socket, self._folder, rights, names)

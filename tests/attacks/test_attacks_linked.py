@@ -152,6 +152,17 @@ def test_new_members_leave_the_link_and_who_is_there_alone(place: Scene, region:
             assert bus.request(TILE, b"", kind="tile", timeout_s=10)
 
 
+def test_a_new_router_makes_links_anew_and_they_carry_on(place: Scene, region: str) -> None:
+    """Two lists with another router each: the region's router opens another trunk; its vehicles are answered again."""
+    with at(place, "vehicle.a", region) as bus, at(place, "operator.ops", place.endpoint) as operator:
+        for n in range(2):
+            place.issue(f"router.more-{n}")
+            publish_list(place, operator)
+            for _ in range(6):
+                assert bus.request(TILE, b"", kind="tile", timeout_s=30)
+                time.sleep(SETTLE_S)
+
+
 def test_attack_revoked_router_is_no_second_way(place: Scene, region: str, tmp_path: Path) -> None:
     """A region's router that was revoked links again and again; nothing passes its link in either direction."""
     identity = place.issue("router.lost")
