@@ -49,6 +49,9 @@ _SETTLE_S: Final = 0.5
 """From a link between sessions to its use: zenoh computes its routes 0.1 s after the link has come."""
 FRESH_LOOKS: Final = 4
 """Who has come since so many looks may not have declared everything yet."""
+_AFTER_THE_HUB_S: Final = 2.5
+"""All linked routers hear of a list at once. Sessions that link up on both sides of a link at one time may not find each
+other: a hub is done after so long, then those that link with it begin."""
 _TAKEN_OVER_S: Final = 5.0
 _POLL_S: Final = 0.01
 _ROUTER: Final = "router."
@@ -81,7 +84,7 @@ class SecureRouter:
         self._closed = threading.Event()
         self._generations: list[_Generation] = []
         self._trunk: _Trunk | None = None
-        self._number = 0
+        self._number, self._due_s = 0, 0.0
         self._heard: bytes | None = None
         self._refused = b""
         self._said_s: dict[str, float] = {}
@@ -149,6 +152,7 @@ class SecureRouter:
             if new.number <= self.members.number or self.is_closed:
                 return False
             old, self.members = self.members, new
+            self._due_s = time.monotonic() + (_AFTER_THE_HUB_S if self._connect else 0.0)
             _LOG.info("list %d: %d members, %d revoked", new.number, len(new.members), len(new.revoked))
             gone = new.revoked | {one.common_name for one in old.members - new.members}
             if gone & {one.common_name for one in old.members}:
@@ -161,7 +165,7 @@ class SecureRouter:
     def _catch_up(self) -> None:
         """Opens a session with the rights of now, unless the newest has them; tried again where it fails."""
         with self._lock:
-            if self._closed.is_set():
+            if self._closed.is_set() or time.monotonic() < self._due_s:
                 return
             gone = None
             if self._trunk is not None and self._trunk.names != self._routers():
