@@ -50,8 +50,8 @@ _SETTLE_S: Final = 0.5
 FRESH_LOOKS: Final = 4
 """Who has come since so many looks may not have declared everything yet."""
 _AFTER_THE_HUB_S: Final = 2.5
-"""All linked routers hear of a list at once. Sessions that link up on both sides of a link at one time may not find each
-other: a hub is done after so long, then those that link with it begin."""
+"""All linked routers hear of a list at once. Sessions that link up on both sides of a link at one time may not find
+each other: a hub is done after so long, then those that link with it begin."""
 _TAKEN_OVER_S: Final = 5.0
 _POLL_S: Final = 0.01
 _ROUTER: Final = "router."
