@@ -17,6 +17,8 @@ NAMES: Final = (
     "poles",
     "stalled",
     "outage",
+    "router_loss",
+    "shares",
     "flooder",
     "herd",
     "dearest",
