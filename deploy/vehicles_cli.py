@@ -163,7 +163,7 @@ def _print_why(console: Console, values: dict[str, Any]) -> None:
         console.print(_said_impossible(values["impossible_places"]), highlight=False)
     if values["not_heard_in"]:
         console.print(f"not heard about some kinds of change in {values['not_heard_in']} windows of tiles")
-    if poses is not None:
+    if poses is not None and poses["says"]:
         console.print(poses["says"])
     for one in values["waiting"]:
         console.print(f"waits in tile {one['tile']}: {one['voxels']} voxels ({one['reason']})", highlight=False)

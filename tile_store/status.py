@@ -121,7 +121,11 @@ def named_vehicles(store: Store) -> list[dict[str, Any]]:
 
 
 def naming_line(account: VehicleAccount) -> str:
-    """Such as "vehicle v3: 17 of 20 tiles explained by a shift of 0.31 m (0.30 m left), 0.5°: check its mount"."""
+    """Such as "vehicle v3: 17 of 20 tiles explained by a shift of 0.31 m (0.30 m left), 0.5°: check its mount"; empty
+    where there is nothing against its mount.
+    """
+    if not account.is_named:
+        return ""
     says = []
     if account.is_shifted:
         shift = (

@@ -257,6 +257,7 @@ def test_the_line_about_a_shifted_vehicle_tells_how_far_and_where_to():
         "check its mount"
     )
     assert "(" not in naming_line(replace(account, forward_m=None, left_m=None))
+    assert naming_line(replace(account, is_shifted=False)) == ""
 
 
 def test_status_tells_why_the_vehicle_itself_doubts(store):

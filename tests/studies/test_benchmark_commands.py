@@ -7,7 +7,13 @@ from click.testing import CliRunner
 
 from studies.__main__ import NAMES, alone
 
-WITH_OPTIONS = {"poles": "--sensors", "flooder": "--kinds", "dearest": "--seconds", "many-tiles": "--tiles"}
+WITH_OPTIONS = {
+    "poles": "--sensors",
+    "flooder": "--kinds",
+    "dearest": "--seconds",
+    "many-tiles": "--tiles",
+    "router_loss": "--kills",
+}
 
 
 @pytest.mark.parametrize("name", NAMES)
