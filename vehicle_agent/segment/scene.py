@@ -185,7 +185,7 @@ def belief(passed: U8, met: U8, mass_moving: float, mass_static: float) -> tuple
     """
     doubt_moving = (1.0 - mass_moving) ** passed.astype(np.float64)
     doubt_static = (1.0 - mass_static) ** (met / WEIGHTS)
-    conflict = (1.0 - doubt_moving) * (1.0 - doubt_static)
-    moving = (1.0 - doubt_moving) * doubt_static / (1.0 - conflict)
-    static = (1.0 - doubt_static) * doubt_moving / (1.0 - conflict)
+    agreed = doubt_moving + doubt_static - doubt_moving * doubt_static  # 1 - conflict, which would lose its digits
+    moving = (1.0 - doubt_moving) * doubt_static / agreed
+    static = (1.0 - doubt_static) * doubt_moving / agreed
     return moving, static
