@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 from postgres_fixtures import new_database, postgres
 from suite_groups import (
@@ -29,6 +30,11 @@ __all__ = [
     "s3_server",
     "served",
 ]
+
+# Whether a commit is good must not depend on what is drawn, nor on how busy the machine is.
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None, max_examples=60)
+hypothesis.settings.register_profile("random", derandomize=False)  # pytest --hypothesis-profile=random
+hypothesis.settings.load_profile("same")
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
