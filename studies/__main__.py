@@ -17,7 +17,7 @@ NAMES: Final = (
     "poles",
     "stalled",
     "outage",
-    "router_loss",
+    "router-loss",
     "shares",
     "flooder",
     "herd",

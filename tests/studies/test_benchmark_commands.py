@@ -12,7 +12,7 @@ WITH_OPTIONS = {
     "flooder": "--kinds",
     "dearest": "--seconds",
     "many-tiles": "--tiles",
-    "router_loss": "--kills",
+    "router-loss": "--kills",
 }
 
 
