@@ -132,16 +132,19 @@ def report_of_row(row: ReportRow, parameters: MergeParameters) -> Report:
 
 
 def reports_by_window(
-    rows: Iterable[ReportRow], parameters: MergeParameters, unreadable: Callable[[ReportRow, SchemaError], object]
+    rows: Iterable[ReportRow],
+    parameters_of: Callable[[int], MergeParameters],
+    unreadable: Callable[[ReportRow, SchemaError], object],
 ) -> dict[int, list[Report]]:
-    """The reports by window; of one that came in two parts the second, if it is there. `rows`: by id and part.
+    """The reports by window, each read with the parameters of its window; of one that came in two parts the second, if
+    it is there. `rows`: by id and part.
 
     What can no longer be read is left out, and `unreadable` is told.
     """
     found: dict[int, dict[str, Report]] = {}
     for row in rows:
         try:
-            found.setdefault(row.window, {})[row.report_id] = report_of_row(row, parameters)
+            found.setdefault(row.window, {})[row.report_id] = report_of_row(row, parameters_of(row.window))
         except SchemaError as error:
             unreadable(row, error)
     return {window: list(reports.values()) for window, reports in found.items()}

@@ -11,6 +11,7 @@ from gnd.cloud_merger.features.kept import FeatureContents
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, refuted_of, windows_of
 from gnd.cloud_merger.map_parameters import digest_of, has_hearing, judges_met, text_of, with_text
 from gnd.cloud_merger.memory import TileMemory
+from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.statements import Report
 from gnd.cloud_merger.stored import Bases, lattice_of_tile, reports_by_window
 from gnd.cloud_merger.window import MergedWindow, TileState, WindowMerger, fold
@@ -208,10 +209,10 @@ class Verifier:
         bases = {sha: gaussians for sha, gaussians in found.items() if gaussians is not None}
         owners = self._store.owners_of({row.vehicle for row in journal.rows})
 
-        def said(window: int) -> list[Report]:
-            rows = [row for row in journal.rows if row.window == window]
-            rules = self._with(journal.how(window).parameters)[0].merge
-            return reports_by_window(rows, rules, _left_out).get(window, [])
+        def parameters_of(window: int) -> MergeParameters:
+            return self._with(journal.how(window).parameters)[0].merge
+
+        said = reports_by_window(journal.rows, parameters_of, _left_out)
 
         def merged(window: int, reports: Sequence[Report]) -> MergedWindow:
             how = journal.how(window)
@@ -229,9 +230,9 @@ class Verifier:
             return merger.merge(state, reports, lattice_of_tile(begun, epoch, config.codec))
 
         for window in journal.windows_before:
-            if reports := said(window):  # of one that can no longer be read nothing was folded
+            if reports := said.get(window):  # of one that can no longer be read nothing was folded
                 state = fold(state, merged(window, reports))
-        return merged(journal.basis.window, said(journal.basis.window)).gaussians
+        return merged(journal.basis.window, said.get(journal.basis.window, [])).gaussians
 
     def _computed_features(self, journal: _Journal) -> FeatureTile:
         layer, tile = journal.layer, journal.tile

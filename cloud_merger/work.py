@@ -58,6 +58,7 @@ class Worker:
         self._store, self._config = store, config
         self._contents, self._features = bases or Bases(store), FeatureContents(store)
         self._shifts, self._parameters = ShiftTests(), text_of(config)
+        self._configs = {"": config, self._parameters: config}
         self._snapping, self._made = Snapping(), ByObject[Tile](REMEMBERED_TILES)
         self._begun: dict[Claim, bool] = {}  # whether the lease was still held
 
@@ -147,12 +148,17 @@ class Worker:
     def _of_gaussians(self, work: TileWork, named: frozenset[str]) -> Publication:
         """Of a tile of the voxel map."""
         tile = work.claim.tile
-        by_window = reports_by_window(work.reports, self._config.merge, self._unreadable)
-        state, merges, closed, again = self._merged(work, by_window, named)
+        folded = self._folded_before(work)
+        by_window = reports_by_window(
+            work.reports,
+            lambda window: self._with(folded[window].parameters if window in folded else "").merge,
+            self._unreadable,
+        )
+        state, merges, closed, again = self._merged(work, by_window, folded, named)
         with_new = with_copies(named, joined(one for merged in merges for one in merged.coincidences))
         if with_new != named:  # what was sent twice decides in no version, not even until the store knows
             named = with_new
-            state, merges, closed, again = self._merged(work, by_window, named)
+            state, merges, closed, again = self._merged(work, by_window, folded, named)
         now, version = merges[-1], work.base_version + 1
         # others were judged when they were closed
         windows = zip([*closed, work.journal.window], merges, strict=True)
@@ -175,48 +181,62 @@ class Worker:
         )
 
     def _merged(
-        self, work: TileWork, by_window: Mapping[int, Sequence[Report]], named: frozenset[str]
+        self,
+        work: TileWork,
+        by_window: Mapping[int, Sequence[Report]],
+        folded: Mapping[int, ClosedWindow],
+        named: frozenset[str],
     ) -> tuple[TileState, list[MergedWindow], list[int], Mapping[int, ClosedWindow]]:
-        """What `_through_windows` gives, and of the closed windows those that were folded before and are folded anew,
-        because somebody else counts now.
+        """What `_through_windows` gives, and how those windows are folded anew that were folded before, because
+        somebody else counts now: as then, but for who does not count.
         """
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
         now_so = ClosedWindow(named, self._parameters)
-        lattice = lattice_of_tile(work.epoch, epoch, self._config.codec)
-        again = self._folded_before(work, by_window, named)
+        again = {
+            window: ClosedWindow(how.named - counted_out(how.named) | counted_out(named), how.parameters)
+            for window, how in folded.items()
+            if window in by_window
+        }
         mergers = {how: self._merger(work, how) for how in {now_so, *again.values()}}
+
+        def merge(window: int, state: TileState, reports: Sequence[Report] | None) -> MergedWindow:
+            how = again.get(window, now_so)
+            lattice = lattice_of_tile(work.epoch, epoch, self._with(how.parameters).codec)
+            return mergers[how].merge(state, reports or [], lattice)
+
         state, merges, closed = _through_windows(
             self._contents.state(work.claim.tile, work.journal),
             by_window,
             work.journal.window,
-            lambda window, state, reports: mergers[again.get(window, now_so)].merge(state, reports or [], lattice),
+            merge,
             lambda state, merged, _reports: fold(state, merged),
         )
         return state, merges, closed, again
 
-    def _folded_before(
-        self, work: TileWork, by_window: Mapping[int, object], named: frozenset[str]
-    ) -> dict[int, ClosedWindow]:
-        """Of the closed windows those that were folded before: as then, but for who does not count now."""
-        if all(window >= work.journal.window for window in by_window):
+    def _folded_before(self, work: TileWork) -> dict[int, ClosedWindow]:
+        """How the closed windows were folded, where reports of them are to be folded anew."""
+        if all(row.window >= work.journal.window for row in work.reports):
             return {}
         told = self._store.closed_windows(work.claim.layer, work.claim.tile)
         return {
-            window: ClosedWindow(told[window].named - counted_out(told[window].named) | counted_out(named),
-                                 told[window].parameters or self._parameters)
-            for window in by_window
-            if window < work.journal.window and window in told
-        }  # fmt: skip
+            window: replace(how, parameters=how.parameters or self._parameters)
+            for window, how in told.items()
+            if window < work.journal.window
+        }
+
+    def _with(self, parameters: str) -> ShardConfig:
+        """The configuration with which a window was merged; "": the shard's own."""
+        if parameters not in self._configs:
+            self._configs[parameters] = with_text(self._config, parameters)
+        return self._configs[parameters]
 
     def _merger(self, work: TileWork, how: ClosedWindow) -> WindowMerger:
-        config = self._config if how.parameters == self._parameters else with_text(self._config, how.parameters)
-        shifts = self._shifts
-        bases = self._bases(work)
+        config = self._with(how.parameters)
         return WindowMerger(
             config.merge,
             config.confirmation,
-            shifts,
-            bases,
+            self._shifts,
+            self._bases(work),
             how.named,
             self._snapping,
             has_hearing(how.parameters),

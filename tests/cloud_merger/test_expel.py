@@ -195,3 +195,31 @@ def test_a_text_stands_in_the_store_once(cloud):
     cloud.sees(crowd(4), {7: POLE}, later_s=4000)
     n = cloud.store.look(lambda c: c.execute("SELECT COUNT(*) FROM merge_parameters").fetchall()[0][0])
     assert n == 1
+
+
+@pytest.mark.parametrize(
+    ("then", "now"),
+    [
+        ({"merge": MergeParameters(sensor_weights={"VLP-16": 0.2})}, {}),
+        ({}, {"merge": MergeParameters(sensor_weights={"VLP-16": 0.2})}),
+        ({"codec": "compact"}, {"codec": "standard"}),
+    ],
+    ids=["weighted", "weighted now", "codec"],
+)
+def test_windows_that_are_folded_anew_keep_the_parameters_of_their_time(tmp_path, then, now):
+    """A shard goes on with other parameters; then a vehicle is quarantined, so what is closed is folded anew."""
+    cloud = Cloud(tmp_path / "map.sqlite", base={} if "codec" in then else BASE)
+    usual = cloud.config
+    cloud.config = replace(usual, **then)
+    cloud.sees(["bad"], {11: BALL}, observed=[11])
+    cloud.sees(["none", "neither"], observed=[3, 4], sensor="HDL-64E")
+    cloud.sees(crowd(4), {3: BALL, 4: POLE}, observed=[3, 4])
+    cloud.sees(["c"], {7: POLE}, observed=[7], later_s=4000)
+    cloud.config = replace(usual, **now)
+    cloud.sees(crowd(2, "then"), {8: POLE}, observed=[8], later_s=4000)
+    cloud.store.quarantine_vehicle("bad", "for this test")
+    cloud.sees(["last"], {9: POLE}, observed=[9], later_s=60)
+    told = json.loads(call(cloud, "verify", "--json", "--all-versions").output)
+    assert (told["identical"], told["unknown"]) == (True, 0), told
+    assert told["same"] >= 3
+    cloud.store.close()

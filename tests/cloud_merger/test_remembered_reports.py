@@ -37,7 +37,7 @@ def test_a_row_that_cannot_be_read_is_told_each_time_and_left_out():
         ReportRow(f"{n:026d}", "ndt", TILE, "v", 5, body, window=1, seq=n) for n, body in enumerate((good[1], b"?"), 1)
     ]
     for _ in range(2):
-        found = reports_by_window(rows, rules, lambda row, _: told.append(row.seq))
+        found = reports_by_window(rows, lambda _window: rules, lambda row, _: told.append(row.seq))
         assert [len(reports) for reports in found.values()] == [1]
     assert told == [2, 2]
     assert report_of_row(rows[0], rules) is report_of_row(rows[0], rules)

@@ -42,12 +42,12 @@ START_NS = 1_800_000_000_000_000_000
 class Cloud:
     """A store and a worker; vehicles come by, each with the newest version unless another is named."""
 
-    def __init__(self, path, together=False, **store):
+    def __init__(self, path, together=False, base=BASE, **store):
         merge = MergeParameters(together=together)
         self.config = ShardConfig(store_path=path, confirmation=VOXEL_BY_VOXEL, merge=merge)
         self.now_ns = START_NS
         self.store = SqliteStore(path, StoreConfig(merge_delay_s=0.0, **store), now_ns=lambda: self.now_ns)
-        self.store.put_tiles([Tile(TILE, 1, gaussians_of(BASE))])
+        self.store.put_tiles([Tile(TILE, 1, gaussians_of(base))])
         self.number = 0
 
     def head(self):
@@ -56,7 +56,17 @@ class Cloud:
     def ids(self):
         return self.head().voxel_id.tolist()
 
-    def hears(self, vehicle, changed=None, observed=EVERYTHING, base=None, later_s=60.0, withheld=(), unsure=None):
+    def hears(
+        self,
+        vehicle,
+        changed=None,
+        observed=EVERYTHING,
+        base=None,
+        later_s=60.0,
+        withheld=(),
+        unsure=None,
+        sensor="VLP-16",
+    ):
         """One report: these voxels changed against the version, it is unsure of some, the others are as in it."""
         self.now_ns += round(later_s * 1e9)
         self.number += 1
@@ -64,7 +74,7 @@ class Cloud:
         change = change_of(base, sorted({*observed, *(changed or {})}), changed or {}, withheld=withheld)
         change = replace(change, unsure=gaussians_of(unsure or {}, 10, 10))
         times = {"first_ns": self.now_ns - 10**9, "last_ns": self.now_ns}
-        report = replace(report_of(self.number, change, vehicle=vehicle), **times)
+        report = replace(report_of(self.number, change, vehicle=vehicle), sensor_model=sensor, **times)
         ((tile, body),) = split(report)
         (row,) = rows_of(report, self.now_ns, together=self.config.merge.together)
         assert (row.tile, row.body) == (tile, body)
