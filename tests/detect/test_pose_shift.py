@@ -109,6 +109,44 @@ def test_along_a_corridor_nothing_is_claimed_and_across_it_an_error_is_found() -
     assert across.shift_m[1] == pytest.approx(-0.3, abs=0.03)
 
 
+TRUCK: tuple[Wall, ...] = (((-9.0, 2.0), (9.0, 2.0)), ((-9.0, 4.4), (9.0, 4.4)))
+"""Stands where the map has nothing: enough that does not fit, so that the search begins around the pose, too."""
+
+
+@pytest.fixture(scope="module", params=[(150.0, 0.01), (20.0, 0.1)], ids=["even walls", "rough walls"])
+def corridor(request: pytest.FixtureRequest) -> LocalMap:
+    """The map of even walls has no information along them, that of rough walls has some, and it is of chance."""
+    per_m2, noise_m = request.param
+    return map_of(CORRIDOR, per_m2, noise_m)
+
+
+@pytest.mark.parametrize("ahead_m", [0.0, 0.3, 0.5])
+@pytest.mark.parametrize("seed", range(8, 12))
+def test_along_a_corridor_nothing_is_found_together_with_a_little_across_it(
+    corridor: LocalMap, ahead_m: float, seed: int
+) -> None:
+    """5 cm across are there and no finding; they must not take along what begins 60 cm ahead of the pose."""
+    shift_found = found(corridor, seen((*CORRIDOR, *TRUCK), seed), shift(ahead_m, 0.05))
+    assert shift_found.misfits > 0.05 * shift_found.voxels
+    assert shift_found.z > PARAMETERS.z
+    assert abs(shift_found.shift_m[0]) < 0.01
+    assert not shift_found.is_pose_error(PARAMETERS, SURE)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [shift(0.0, 0.4), shift(0.5, 0.4), shift(0.0, -0.2), shift(0.3, 0.0, 0.5), shift(0.3, z_m=0.2)],
+    ids=["40 cm across", "and along", "20 cm across", "half a degree", "20 cm up"],
+)
+def test_in_a_corridor_all_other_errors_are_found(corridor: LocalMap, error: NDArray[np.float64]) -> None:
+    shift_found = found(corridor, seen((*CORRIDOR, *TRUCK), 8), error)
+    assert shift_found.is_pose_error(PARAMETERS, SURE)
+    left = error @ shift_found.T
+    assert left[1:3, 3] == pytest.approx([0.0, 0.0], abs=0.05)
+    assert np.abs(left[:3, :3] - np.eye(3)).max() < 0.003
+    assert abs(shift_found.shift_m[0]) < 0.01
+
+
 def test_what_no_test_can_tell_is_taken_for_a_pose_error(yard: LocalMap) -> None:
     """All that stands has moved alike: the ground alone does not say where the vehicle is. To be late is no harm."""
     all_moved = [((a[0] + 0.5, a[1]), (b[0] + 0.5, b[1])) for a, b in WALLS]

@@ -49,10 +49,10 @@ def surfaces(walls: Sequence[Wall], rng: np.random.Generator, per_m2: float, noi
     return points + rng.normal(0.0, noise_m, points.shape)
 
 
-def map_of(walls: Sequence[Wall] = WALLS) -> LocalMap:
+def map_of(walls: Sequence[Wall] = WALLS, per_m2: float = 150.0, noise_m: float = 0.01) -> LocalMap:
     """The map of the yard as it was."""
     accumulator = VoxelAccumulator(GRID_FRAME)
-    accumulator.add(surfaces(walls, np.random.default_rng(1), 150.0, 0.01))
+    accumulator.add(surfaces(walls, np.random.default_rng(1), per_m2, noise_m))
     local_map = LocalMap(GRID_FRAME)
     for tile_id, gaussians in accumulator.finish().items():
         local_map.set_tile(Tile(tile_id, 1, gaussians))

@@ -5,8 +5,13 @@ error does vanish: what did not fit fits then, and what fitted stays. So two hyp
 the pose as it is and at the best pose nearby: a paired test, in which voxels are the samples. What a shift does not
 change (ground under a shift along it, walls along a street) fits equally well under both and does not count; changed
 voxels fit badly under both and do not count either.
+
+The test says that a shift fits better, not which part of it does. A motion along a motorway changes nothing, and comes
+along with any real gain across it. So directions that nothing constrains are left out of what registration finds, and
+each other part of it must pass the paired test by itself.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,6 +25,7 @@ from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import WITHOUT_WHEELS, RegistrationParameters
+from gnd.vehicle_agent.localise.registration import LEVER_M as LEVER_M_OF_TURNS
 from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, register
 
 _GRID_M: Final = 1.0
@@ -39,6 +45,11 @@ _AROUND_M: Final = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6), (0.0, -0.6))
 LEVER_M: Final = 25.0
 """Distance at which turns are measured: 0.2 degrees move a point there by 9 cm."""
 _REGISTRATION: Final = RegistrationParameters(rules=WITHOUT_WHEELS)
+_LEVERS_M: Final = np.array([LEVER_M_OF_TURNS] * 3 + [1.0] * 3)
+_PLANAR: Final = (2, 3, 4)
+"""Heading, forward and left of a motion, turns first."""
+_PART_M: Final = 0.01
+"""Smaller parts are below what registration claims to know (`MatchRules.floor_m`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,23 +159,59 @@ def find_shift(points_vehicle_m: F64, T_map_vehicle: F64, match_map: MatchMap, *
     was = voxels.mean(before)
     misfits = int((was > _MISFIT).sum())
     found = _candidates(points, T_map_vehicle, match_map, wide=misfits >= _MANY_MISFITS * voxels.n)
-    best = no_shift(voxels.n, misfits, checked=any(_constrains(one) for one in found))
-    least = float(was.sum())
-    for one in found:
-        T = T_inverse(T_map_vehicle) @ one.T_map_vehicle
-        T = _flat(T) if planar else T
-        after = costs_at(points, T_map_vehicle @ T, match_map)
-        now = voxels.mean(np.where(after < 0.0, before, after))
-        if float(now.sum()) < least:
-            least = float(now.sum())
-            best = _compared(T, was, now, checked=best.checked)
-    return best
+
+    def costs(motion: F64) -> F64:
+        after = costs_at(points, T_map_vehicle @ _moved(motion), match_map)
+        return voxels.mean(np.where(after < 0.0, before, after))
+
+    checked = any(_constrains(one) for one in found)
+    motions = [_motion(T_inverse(T_map_vehicle) @ one.T_map_vehicle, one, planar=planar) for one in found]
+    sums = [float(costs(motion).sum()) for motion in motions]
+    if not sums or min(sums) >= float(was.sum()):
+        return no_shift(voxels.n, misfits, checked=checked)
+    best = int(np.argmin(sums))
+    motion, dropped_m = _sure_parts(motions[best], _principal(found[best], planar=planar), costs)
+    return _compared(_moved(motion), was, costs(motion), checked=checked and dropped_m < OF_SCANS.least_m)
 
 
-def _flat(T: F64) -> F64:
-    """Only forward, left and heading of a shift."""
-    turn = np.array([0.0, 0.0, np.arctan2(T[1, 0], T[0, 0])])
-    return T_from_R_t(exp_so3(turn), np.array([T[0, 3], T[1, 3], 0.0]))
+def _sure_parts(motion: F64, directions: F64, costs: Callable[[F64], F64]) -> tuple[F64, float]:
+    """A motion (6,) without the parts along unit directions (K, 6), the first one first, without which the costs (n,)
+    of the voxels are not surely worse; and the largest part that was left out, metres.
+    """
+    dropped_m, now = 0.0, costs(motion)
+    for direction in directions:
+        part_m = float(direction @ motion)
+        if abs(part_m) < _PART_M:
+            continue
+        without = motion - part_m * direction
+        then = costs(without)
+        if _z(then - now) < OF_SCANS.z:
+            motion, now, dropped_m = without, then, max(dropped_m, abs(part_m))
+    return motion, dropped_m
+
+
+def _motion(T: F64, found: RegistrationResult, *, planar: bool) -> F64:
+    """(6,) a shift as turns (times their lever) and metres, without what registration says nothing constrains."""
+    motion = np.concatenate([log_so3(T[:3, :3]), T[:3, 3]]) * _LEVERS_M
+    motion = motion - found.degenerate.T @ (found.degenerate @ motion)
+    if planar:
+        motion[[k for k in range(6) if k not in _PLANAR]] = 0.0
+    return np.asarray(motion)
+
+
+def _moved(motion: F64) -> F64:
+    """(4, 4) of a motion (6,)."""
+    xi = motion / _LEVERS_M
+    return T_from_R_t(exp_so3(xi[:3]), xi[3:])
+
+
+def _principal(found: RegistrationResult, *, planar: bool) -> F64:
+    """(K, 6) the independent directions of a registration, the least constrained one first."""
+    free = list(_PLANAR if planar else range(6))
+    covariance = (found.covariance * _LEVERS_M * _LEVERS_M[:, None])[np.ix_(free, free)]
+    directions = np.zeros((len(free), 6))
+    directions[:, free] = np.linalg.eigh(covariance)[1].T[::-1]
+    return directions
 
 
 def gain(points_vehicle_m: F64, T_before: F64, T_after: F64, match_map: MatchMap) -> float:
