@@ -13,6 +13,7 @@ from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.schemas.changes import TileChange
 from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.detect.extension import cells_at_half, extends_neighbour
+from gnd.vehicle_agent.detect.kernel import ETA_BLOCK
 from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
 from gnd.vehicle_agent.detect.permeable import is_gone
 from gnd.vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
@@ -49,7 +50,9 @@ def classify(evidence: TileEvidence, parameters: DetectParameters) -> Classifica
 
     The state is the largest mass after Eq. (11); a voxel is new, modified or deleted when it is `changed`. `default`
     mode adds: a new Gaussian of the map's shape keeps the voxel normal, one of another shape makes even a sustained
-    voxel modified (`shape_change`); deletion needs fewer hits than chance explains (`permeable`); a new Gaussian must
+    voxel modified (`shape_change`), if more of it lies outside the map's Gaussian than of one that stands there;
+    deletion needs fewer hits than chance explains (`permeable`), and a plane where all rays lay at one height; a new
+    Gaussian must
     be more than the edge of a known surface (`extension`); too few hits, too few rays or a tie abstain, and with
     `together` what was met is told to the cloud (`unsure`).
     """
@@ -91,10 +94,11 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     state = _state(e, p)
     has_gaussian = e.measured.cells >= MIN_CELLS
     sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
-    reshaped = has_gaussian & ~_same_shape(e, p)
+    reshaped = has_gaussian & _is_outside(e) & ~_same_shape(e, p)
     gone = changed & (e.measured.cells < p.rules.weak_cells)
     rows = np.flatnonzero(gone & e.in_map)
-    gone[rows] = is_gone(e.base.gaussians.take(e.map_row[rows]), (e.n_bi + e.n_bo)[rows], e.n_pi[rows])
+    was = e.base.gaussians.take(e.map_row[rows])
+    gone[rows] = is_gone(was, (e.n_bi + e.n_bo)[rows], e.n_pi[rows], at_one_height=e.at_one_height)
     return np.select(
         [reshaped & (sustained | changed), sustained | (changed & has_gaussian), gone],
         [ChangeClass.MODIFIED, ChangeClass.NORMAL, ChangeClass.DELETED],
@@ -120,6 +124,15 @@ def _is_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
     rows = np.flatnonzero(new & (cells < p.new_cells_at_edge))
     new[rows] = ~extends_neighbour(e.base, e.measured.take(rows))
     return np.asarray(new)
+
+
+def _is_outside(e: TileEvidence) -> NDArray[np.bool_]:
+    """(K,) whether more points ended outside the map's Gaussian than Eq. (1) leaves outside where it stands unchanged.
+
+    What has another shape lies elsewhere. A part of what the map holds does not: of a wall's foot, in one Gaussian with
+    the ground, a few level layers meet the wall alone, and its shape is another one than that of both.
+    """
+    return np.asarray(e.n_bo > (1.0 - ETA_BLOCK) * (e.n_bi + e.n_bo))
 
 
 def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:

@@ -47,6 +47,7 @@ class ChangeDetector:
         self._points = VoxelAccumulator(local_map.grid_frame)
         self._poses = TileUncertainties(local_map.grid_frame)
         self._window: _VoxelWindow | None = None
+        self._sees_heights = False
 
     def add_scan(
         self,
@@ -54,6 +55,8 @@ class ChangeDetector:
         origins_map_m: F64,
         moving: NDArray[np.bool_] | None = None,
         pose: PoseUncertainty = CERTAIN,
+        *,
+        sees_heights: bool = True,
     ) -> int:
         """Count the rays of one scan.
 
@@ -62,6 +65,7 @@ class ChangeDetector:
             origins_map_m: (N, 3) the sensor at each point, or (3,) for all.
             moving: (N,) bool, points on moving objects ([50] in GND): their rays pass, their ends count for nothing.
             pose: how well the scan's pose is known; it softens the evidence of its rays.
+            sees_heights: False for a scan of a few level layers (`gnd.vehicle_agent.localise.level`).
 
         Returns:
             How many rays were cast.
@@ -80,6 +84,7 @@ class ChangeDetector:
         window = self._current()
         if not len(points) or not window.state.size:
             return 0
+        self._sees_heights |= sees_heights
         middle = 0.5 * (origins[0] + origins[-1])
         affine = self.local_map.grid_frame.affine(middle)
         A, b = window_affine(*affine, window.anchor_m, window.origin_g)
@@ -168,7 +173,8 @@ class ChangeDetector:
         window.records.words[window.rows[tile_id], N_BI:] = 0
         seen = tile.gaussians.voxel_id[counters.any(axis=1)]
         found = tile_evidence(tile, counters, passes, np.union1d(seen, measured.voxel_id), measured)
-        return replace(found, pose=self._poses.pop(tile_id) or of_passes)
+        pose = self._poses.pop(tile_id) or of_passes
+        return replace(found, pose=pose, at_one_height=not self._sees_heights)
 
     def _take_passes(self, window: _VoxelWindow, tile_id: TileId) -> tuple[I32, I32]:
         """Voxel ids and pass counts of the tile's empty voxels that rays crossed."""

@@ -40,6 +40,9 @@ class TileEvidence:
     """(K,) the points that ended in each voxel as a Gaussian, however few they are; count 0 where none did."""
     pose: PoseUncertainty = field(default_factory=PoseUncertainty)
     """How well the poses of the scans were known that gave the evidence."""
+    at_one_height: bool = False
+    """Whether all rays came from a few level layers (`gnd.vehicle_agent.localise.level`): they meet a voxel at one
+    height, however many they are."""
 
     def __post_init__(self) -> None:
         """The columns belong together."""

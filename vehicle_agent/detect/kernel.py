@@ -18,7 +18,7 @@ from gnd.vehicle_agent.detect.parameters import INCLUDED_M, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
-_ETA_BLOCK: Final = 0.95
+ETA_BLOCK: Final = 0.95
 """η_bound of Eq. (1) for points that end in a voxel."""
 _ETA_PLANE: Final = 0.97
 """The same for the point where a ray crosses the plane of a planar Gaussian."""
@@ -82,7 +82,7 @@ def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> K
     """
     return KernelParameters(
         rule=RULES[p.rules.passing_rule],
-        r2_block=quantile(_ETA_BLOCK),
+        r2_block=quantile(ETA_BLOCK),
         r2_pass=quantile(p.rules.eta_pass),
         r2_plane=quantile(_ETA_PLANE),
         r2_face=_FACE_SIGMA**2,

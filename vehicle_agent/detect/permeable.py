@@ -4,6 +4,10 @@ Leaves, bushes, wire and the rims of things stop only a part of the rays that me
 false deletions were Gaussians that most rays of the mapping drive itself had passed. Far from the vehicle few rays meet
 such a Gaussian, and that all of them pass is chance, not change. So it is gone only where so few hits of so many rays
 are improbable for what stops the least that such a Gaussian may stop.
+
+That share is of rays from all heights. A few level layers pass a voxel again and again at one height: over the ground
+and in front of the wall that one Gaussian holds together, hundreds of times without a hit. What they pass says nothing
+of a Gaussian that is no plane; a plane that they cross they would meet.
 """
 
 from typing import Final
@@ -31,7 +35,7 @@ def least_opacity(gaussians: Gaussians) -> F64:
     return np.where(planar, OPACITY_OF_SURFACE, OPACITY_OF_VOLUME)
 
 
-def is_gone(gaussians: Gaussians, hits: I32, passes: I32) -> NDArray[np.bool_]:
+def is_gone(gaussians: Gaussians, hits: I32, passes: I32, *, at_one_height: bool = False) -> NDArray[np.bool_]:
     """(K,) whether so few hits show that a Gaussian is not there any more.
 
     The number of hits is binomial; the test is one-sided at 2 %.
@@ -40,5 +44,8 @@ def is_gone(gaussians: Gaussians, hits: I32, passes: I32) -> NDArray[np.bool_]:
         gaussians: K of the map.
         hits: (K,) rays that ended in its voxel.
         passes: (K,) rays that passed through the Gaussian.
+        at_one_height: all rays came from a sensor of a few level layers.
     """
-    return np.asarray(bdtr(hits, hits + passes, least_opacity(gaussians)) <= _CHANCE)
+    opacity = least_opacity(gaussians)
+    gone = bdtr(hits, hits + passes, opacity) <= _CHANCE
+    return np.asarray(gone & (opacity == OPACITY_OF_SURFACE) if at_one_height else gone)

@@ -41,6 +41,7 @@ from gnd.vehicle_agent.detect.tile_shift import pose_error_of_tile
 from gnd.vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise.level import sees_tilt
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.report.packing import is_measured, pack
@@ -259,7 +260,10 @@ class Reporter:
         self.counts["scans_used"] += 1
         self.counts["points"] += len(segmented.moving)
         self.counts["moving_points"] += int(segmented.moving.sum())
-        self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving, pose)
+        rays = (scan.points_map_m - scan.origins_map_m) @ scan.estimate.T_map_vehicle[:3, :3]
+        self.counts["rays"] += self._detector.add_scan(
+            scan.points_map_m, scan.origins_map_m, segmented.moving, pose, sees_heights=sees_tilt(rays)
+        )
         self._T_map_vehicle = scan.estimate.T_map_vehicle
         self._lengthen(scan.t_ns)
         self._tracks.add_scan(scan)
