@@ -1,5 +1,7 @@
 """From counters to classes, voxel by voxel, and to what is reported."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from vehicle_scene import FIGURE_2
@@ -81,6 +83,15 @@ CASES = [
 def test_the_class_follows_from_the_counters(evidence: TileEvidence, default: str, paper: str) -> None:
     assert said(evidence, DetectParameters()) == default
     assert said(evidence, DetectParameters.paper()) == paper
+
+
+def test_a_part_of_what_the_map_holds_is_no_other_shape_where_rays_lay_at_one_height() -> None:
+    """Points outside of the map's Gaussian decide: more than the 5 % that Eq. (1) leaves outside of what stands."""
+    p = DetectParameters()
+    for outside, level, many in ((0, "NORMAL", "MODIFIED"), (5, "NORMAL", "MODIFIED"), (40, "MODIFIED", "MODIFIED")):
+        e = one(in_map=True, bi=100, bo=outside, pi=60, cells=50, x_m=0.4)
+        assert said(replace(e, at_one_height=True), p) == level
+        assert said(e, p) == many
 
 
 def test_deletion_needs_more_rays_that_passed_than_chance_explains() -> None:

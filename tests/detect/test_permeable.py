@@ -51,3 +51,9 @@ def test_leaves_that_are_there_are_called_gone_once_in_fifty_at_most(opacity: fl
 @pytest.mark.parametrize(("cov", "rays"), [(PLANE, 14), (BUSH, 38)])
 def test_what_is_gone_is_found_with_enough_rays_and_not_before(cov: tuple[float, ...], rays: int) -> None:
     assert is_gone(gaussians([cov, cov]), counts(0, 0), counts(rays, rays - 1)).tolist() == [True, False]
+
+
+def test_rays_at_one_height_delete_planes_only() -> None:
+    both = gaussians([PLANE, BUSH])
+    assert is_gone(both, counts(0, 0), counts(900, 900)).tolist() == [True, True]
+    assert is_gone(both, counts(0, 0), counts(900, 900), at_one_height=True).tolist() == [True, False]

@@ -50,11 +50,10 @@ def classify(evidence: TileEvidence, parameters: DetectParameters) -> Classifica
 
     The state is the largest mass after Eq. (11); a voxel is new, modified or deleted when it is `changed`. `default`
     mode adds: a new Gaussian of the map's shape keeps the voxel normal, one of another shape makes even a sustained
-    voxel modified (`shape_change`), if more of it lies outside the map's Gaussian than of one that stands there;
-    deletion needs fewer hits than chance explains (`permeable`), and a plane where all rays lay at one height; a new
-    Gaussian must
+    voxel modified (`shape_change`); deletion needs fewer hits than chance explains (`permeable`); a new Gaussian must
     be more than the edge of a known surface (`extension`); too few hits, too few rays or a tie abstain, and with
-    `together` what was met is told to the cloud (`unsure`).
+    `together` what was met is told to the cloud (`unsure`). Rays at one height delete planes only, and modify only
+    where something lies outside the map's Gaussian.
     """
     if parameters.mode == "paper":
         return Classification(evidence, _decide_paper(evidence, parameters).astype(np.uint8))
@@ -94,7 +93,9 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     state = _state(e, p)
     has_gaussian = e.measured.cells >= MIN_CELLS
     sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
-    reshaped = has_gaussian & _is_outside(e) & ~_same_shape(e, p)
+    reshaped = has_gaussian & ~_same_shape(e, p)
+    if e.at_one_height:
+        reshaped &= _is_outside(e)
     gone = changed & (e.measured.cells < p.rules.weak_cells)
     rows = np.flatnonzero(gone & e.in_map)
     was = e.base.gaussians.take(e.map_row[rows])
@@ -129,8 +130,8 @@ def _is_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
 def _is_outside(e: TileEvidence) -> NDArray[np.bool_]:
     """(K,) whether more points ended outside the map's Gaussian than Eq. (1) leaves outside where it stands unchanged.
 
-    What has another shape lies elsewhere. A part of what the map holds does not: of a wall's foot, in one Gaussian with
-    the ground, a few level layers meet the wall alone, and its shape is another one than that of both.
+    A part of what the map holds has another shape, too: of a wall's foot, in one Gaussian with the ground, a few level
+    layers meet the wall alone. It lies inside all the same. Many layers would have met the rest.
     """
     return np.asarray(e.n_bo > (1.0 - ETA_BLOCK) * (e.n_bi + e.n_bo))
 
