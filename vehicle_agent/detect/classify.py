@@ -21,6 +21,8 @@ from gnd.vehicle_agent.detect.unsure import has_met, is_unsure, told
 
 _MANY_RAYS: Final = 100
 """So many rays into a voxel without a Gaussian make too few hits a statement: by the one rule it is empty."""
+INSIDE_SHARE: Final = 1.0 - ETA_BLOCK
+"""Of the points in a voxel, so many lie outside of a Gaussian that has not changed (Eq. 1)."""
 _EMPTY_CELLS: Final = 15
 """From here on a voxel is never called empty: another vehicle may find the sub-cells that are missing."""
 
@@ -128,12 +130,12 @@ def _is_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
 
 
 def _is_outside(e: TileEvidence) -> NDArray[np.bool_]:
-    """(K,) whether more points ended outside the map's Gaussian than Eq. (1) leaves outside where it stands unchanged.
+    """(K,) whether more points ended outside the map's Gaussian than of one that stands there unchanged.
 
     A part of what the map holds has another shape, too: of a wall's foot, in one Gaussian with the ground, a few level
     layers meet the wall alone. It lies inside all the same. Many layers would have met the rest.
     """
-    return np.asarray(e.n_bo > (1.0 - ETA_BLOCK) * (e.n_bi + e.n_bo))
+    return np.asarray(e.n_bo > INSIDE_SHARE * (e.n_bi + e.n_bo))
 
 
 def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
