@@ -115,7 +115,7 @@ class PlainDetector:
         if row < -1:
             return
         noise2 = self.p.rules.block_noise_m**2
-        limit = self.quantile(kernel._ETA_BLOCK) * (noise2 + (s2 if self.p.rules.soft else 0.0)) / noise2
+        limit = self.quantile(kernel.ETA_BLOCK) * (noise2 + (s2 if self.p.rules.soft else 0.0)) / noise2
         if row >= 0 and self.world.r2(row, point, self.p.rules.block_noise_m) <= limit:
             self.bi[row] += 1
         elif self._explained(voxel, point, g):
