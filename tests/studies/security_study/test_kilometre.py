@@ -1,6 +1,7 @@
 """The messages of a kilometre are really said, over a router, with seals and TLS."""
 
 from pathlib import Path
+from statistics import median
 
 import pytest
 
@@ -8,6 +9,11 @@ from gnd.deploy.fleet_identities import make_identities
 from studies.security_study.kilometre import KILOMETRE, KilometreMessage, router, wired
 
 pytestmark = pytest.mark.slow
+
+TRIES = 5
+PACKETS = 4 * 52
+"""An acknowledgement of TCP or the end of a query has a packet of its own or shares one, as the machine is busy: the
+count of packets of one message differs by some two between tries, and more in a single one of them."""
 
 
 @pytest.mark.parametrize("protocol", ["tcp", "tls"])
@@ -19,7 +25,8 @@ def test_each_message_passes_the_vehicle_s_connection(tmp_path: Path, protocol: 
     ):
         parts.bytes_of((KILOMETRE[0], KILOMETRE[3]))
         for what in ("question", "report", "word", "telemetry"):
-            small, large = (parts.bytes_of((KilometreMessage(what, 200, 100 * n),)) for n in (1, 9))
+            tries = [[parts.bytes_of((KilometreMessage(what, 200, 100 * n),)) for n in (1, 9)] for _ in range(TRIES)]
+            small, large = (median(column) for column in zip(*tries, strict=True))
             assert small > 200 * (what != "word") + 52
             if what in ("question", "word"):
-                assert 700 < large - small < 1100
+                assert 800 - PACKETS < large - small < 800 + PACKETS, tries
