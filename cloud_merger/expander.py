@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Final
 
+import numpy as np
 from ulid import ULID
 
 from gnd.cloud_merger.checking import MapCheck
@@ -197,6 +198,8 @@ class Expander:
         report = self._short.expanded(claim.upload.key, packed)
         self._map.check(report)
         first = self._short.decided(report)
+        if packed.measured:
+            first = replace(first, mask=np.zeros_like(first.mask))  # all have come
         asked = {tile for tile, ids in asked_voxels(report, first.mask).items() if len(ids)}
         rows = tuple(
             replace(row, is_half=row.tile in asked, is_quiet=row.is_quiet or row.tile in first.hopeless)

@@ -3,7 +3,7 @@
 Pure functions, the counterpart of `gnd.vehicle_agent.report.packing`. What comes out is a `ChangeReport` as if the
 vehicle had sent it whole, but for four things: observed voxels are those that the track predicts, rays are not counted
 (evidence 0), poses are as uncertain as those of the report's worst tile, and a voxel that is new or modified whose
-Gaussian was not asked for has count 0 ("withheld"; its class tells it from one that is deleted).
+Gaussian did not come has count 0 ("withheld"; its class tells it from one that is deleted).
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ def base_versions(packed: PackedReport, district: District) -> tuple[tuple[TileI
 
 
 def expand(packed: PackedReport, layer: str, district: District, bases: Sequence[Tile]) -> ChangeReport:
-    """The report that `packed` stands for, every Gaussian withheld.
+    """The report that `packed` stands for: every Gaussian withheld, or all there where they came along.
 
     Args:
         packed: as it came on the key of `layer` and `district`.
@@ -49,8 +49,8 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
 
     Raises:
         MissingBase: the bases are not those that the vehicle compared with.
-        BadReport: flags or track cannot be read against them; more flags than a report may hold, or at heights that no
-            vehicle sees.
+        BadReport: flags, track or Gaussians cannot be read against them; more flags than a report may hold, or at
+            heights that no vehicle sees.
         SchemaError: a value that no report has.
     """
     shas = [tile.sha if tile.version else b"" for tile in bases]
@@ -68,7 +68,7 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
         observed = observed_along(track, flags)
     except (CodecError, ConfigError, ShapeError, TrackError) as error:
         raise BadReport(f"report {packed.report_id} in {len(packed.flags)} bytes of flags: {error}") from error
-    return ChangeReport(
+    report = ChangeReport(
         report_id=packed.report_id,
         vehicle=packed.vehicle,
         sensor_model=packed.sensor_model,
@@ -83,6 +83,12 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
         layer=layer,
         course=packed.course,
     )
+    return _with_all_measured(report, bases, packed.measured) if packed.measured else report
+
+
+def _with_all_measured(report: ChangeReport, bases: Sequence[Tile], measured: bytes) -> ChangeReport:
+    every = np.ones(sum(int(is_askable(change).sum()) for change in report.tiles), np.bool_)
+    return with_measured(report, {tile.tile_id: tile.gaussians for tile in bases}, every, measured)
 
 
 def _unsure(packed: PackedReport, bases: Sequence[Tile], flags: Sequence[Flags]) -> list[Gaussians]:

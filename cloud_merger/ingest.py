@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from gnd.cloud_merger.admission import Admission
 from gnd.cloud_merger.errors import BadReport
+from gnd.cloud_merger.patience import PatientWords
 from gnd.fleet_bus.refusals import counted
 from gnd.fleet_bus.seals import Holder
 from gnd.fleet_bus.seldom import Seldom
@@ -34,6 +35,7 @@ class Ingest:
         on_stored: called after a new upload is durable.
         now_ns: the clock, int ns UTC.
         admission: who may send how much; None: all may.
+        words: what vehicles are told with the ack of their next report.
     """
 
     def __init__(
@@ -43,9 +45,10 @@ class Ingest:
         on_stored: Callable[[], object] = lambda: None,
         now_ns: Callable[[], int] = clocks.day_ns,
         admission: Admission | None = None,
+        words: PatientWords | None = None,
     ) -> None:
         self._store, self._home, self._on_stored, self._now_ns = store, home, on_stored, now_ns
-        self._admission = admission
+        self._admission, self._words = admission, words or PatientWords()
 
     def answer(self, key: str, payload: bytes, asker: Holder | None = None) -> ChangeAck:
         """The ack of one message: "stored" and "duplicate" only when its bytes are durable.
@@ -72,10 +75,12 @@ class Ingest:
         if asker is not None and asker.owner and head.vehicle:
             self._store.note_owner(head.vehicle, asker.owner, received_ns)
         upload = Upload(key, payload, report_id, head.vehicle, head.form, received_ns)
+        if head.is_patient:
+            self._words.expect(head.vehicle, report_id)  # before anybody looks at it
         status = self._store.put_upload(upload, self._home, patient_s)
         if status == "stored":
             self._on_stored()
-        return ChangeAck(report_id, status)
+        return ChangeAck(report_id, status, told=self._words.take(head.vehicle))
 
     def _check_asker(self, head: UploadHead, asker: Holder | None) -> None:
         """Who seals a report must be who it says it is of; Gaussians do not say it, but their flags did."""

@@ -15,6 +15,7 @@ from gnd.cloud_merger.ingest import Ingest
 from gnd.cloud_merger.leases import Leases
 from gnd.cloud_merger.metrics import ShardMetrics
 from gnd.cloud_merger.ownership import KnownDistricts, KnownShards, Members, following
+from gnd.cloud_merger.patience import PatientWords
 from gnd.cloud_merger.reception import Reception
 from gnd.cloud_merger.release.collector import HealthCollector
 from gnd.cloud_merger.release.keeper import KEEP_EVERY_S, ReleaseKeeper
@@ -70,11 +71,12 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
         open_bus(bus_config, name=config.shard_id) as bus,
     ):
         store.release(config.shard_id)  # leases of an earlier life
-        states = States(store, bus)
+        words = PatientWords()
+        states = States(store, bus, words)
         with worker_process(config, states.tell, metrics_at) as worker:
             admission = Admission(store)
             # look at the outside, keep the bytes
-            ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission)
+            ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission, words=words)
             members = Members(config.shard_id, KnownDistricts(store))
             follow_revoked(bus)
             states.open()
@@ -84,6 +86,7 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
             told = RefusalsTold(_LOG)
             while not stop.wait(config.poll_s):
                 reception.look_again()
+                states.tell_kept()
                 told.tell()
                 if worker.has_ended():
                     store.release(config.shard_id)  # what it had in hand need not wait for the ends of its leases

@@ -3,6 +3,7 @@
 import logging
 from typing import Final
 
+from gnd.cloud_merger.patience import PatientWords
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import BusError, Refused
 from gnd.fleet_bus.serving import Request
@@ -29,21 +30,33 @@ class States:
     Args:
         store: of the uploads.
         bus: open.
+        words: those that wait for an ack.
     """
 
-    def __init__(self, store: Store, bus: Bus) -> None:
-        self._store, self._bus = store, bus
+    def __init__(self, store: Store, bus: Bus, words: PatientWords | None = None) -> None:
+        self._store, self._bus, self._words = store, bus, words or PatientWords()
 
     def open(self) -> None:
         """Begin to answer."""
         self._bus.serve(state_keys(), self._answer, complete=True, workers=2, kind="change")
 
     def tell(self, vehicle: str, state: ReportState) -> None:
-        """Put a notice on the vehicle's key; one that is lost is asked for."""
+        """Put a notice on the vehicle's key, with what waits for it; or keep it for an ack (`PatientWords`)."""
+        if not self._words.keep(vehicle, state):
+            self._put(vehicle, (*self._words.take(vehicle), state))
+
+    def tell_kept(self) -> None:
+        """Tell what has waited long enough."""
+        for vehicle, states in self._words.due():
+            self._put(vehicle, states)
+
+    def _put(self, vehicle: str, states: tuple[ReportState, ...]) -> None:
+        """A notice that is lost is asked for."""
         try:
-            self._bus.publish(want_key(vehicle), ReportStates((state,)).encode(), kind="ack", wait_s=0.0)
+            self._bus.publish(want_key(vehicle), ReportStates(states).encode(), kind="ack", wait_s=0.0)
         except (BusError, SchemaError) as error:
-            _LOG.info("%s is not told that %s is %s: %s", vehicle, state.report_id, state.status, error)
+            last = states[-1]
+            _LOG.info("%s is not told that %s is %s: %s", vehicle, last.report_id, last.status, error)
 
     def _answer(self, request: Request) -> bytes:
         try:

@@ -25,6 +25,7 @@ from gnd.schemas.errors import BadValue, TooLarge
 from gnd.schemas.generated import change_ack_pb2, change_report_pb2, tile_change_pb2
 from gnd.schemas.report_head import check_report_head, check_tiles_of_district
 from gnd.schemas.report_id import check_report_id
+from gnd.schemas.report_states import ReportState, state_message, state_value
 from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
@@ -346,6 +347,8 @@ class ChangeAck:
     """Why it was quarantined or is to be sent again, in one line with numbers."""
     wanted: bytes = b""
     """Status "wanted": of which new and modified voxels Gaussians are asked for (`gnd.gnd_map.codec.encode_mask`)."""
+    told: tuple[ReportState, ...] = ()
+    """How far earlier reports of the vehicle have come that were patient."""
 
     def __post_init__(self) -> None:
         if self.report_id or self.status != "quarantined":
@@ -353,13 +356,15 @@ class ChangeAck:
         check_word(self.status, _STATUS, "ChangeAck status")
         check_text("reason", self.reason, REASON_PATTERN)
         check_length("mask of ChangeAck", len(self.wanted), limits.MAX_WANTED_BYTES, "bytes")
+        check_length("ChangeAck", len(self.told), limits.MAX_STATES_OF_ACK, "states of reports")
         if (self.status == "wanted") != bool(self.wanted):
             raise BadValue(f"ChangeAck {self.status} with a mask of {len(self.wanted)} bytes: one asks for the other")
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeAck."""
+        told = map(state_message, self.told)
         message = change_ack_pb2.ChangeAck(
-            major=MAJOR, report_id=self.report_id, reason=self.reason, wanted=self.wanted
+            major=MAJOR, report_id=self.report_id, reason=self.reason, wanted=self.wanted, told=told
         )
         message.status = change_ack_pb2.ChangeAck.Status.ValueType(number_of(self.status, _STATUS))
         return serialise(message, limits.MAX_CHANGE_ACK_BYTES)
@@ -370,4 +375,5 @@ class ChangeAck:
         message = parse(change_ack_pb2.ChangeAck, data, limits.MAX_CHANGE_ACK_BYTES)
         check_major(message, "ChangeAck")
         status = word_of(message.status, _STATUS, "ChangeAck status")
-        return cls(message.report_id, status, message.reason, message.wanted)
+        check_length("ChangeAck", len(message.told), limits.MAX_STATES_OF_ACK, "states of reports")
+        return cls(message.report_id, status, message.reason, message.wanted, tuple(map(state_value, message.told)))

@@ -63,6 +63,7 @@ MAX_WANTED_BYTES: Final = MAX_FLAGS_OF_REPORT // 8 + KIB
 
 # Reports of a vehicle that one question is about, and fields of the answer.
 MAX_REPORTS_OF_QUESTION: Final = 64
+MAX_STATES_OF_ACK: Final = 16
 
 # Features of one tile, and points of one feature: a motorway's gantry has some twenty signs, a lane's piece some ten
 # points a tile. A look is one camera image's or one scan's detections.

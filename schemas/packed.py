@@ -81,6 +81,11 @@ class PackedReport:
     """Of `gnd.gnd_map.codec.encode_flags`: voxels upon which the vehicle does not decide, all as new; empty: none."""
     unsure_measured: bytes = b""
     """Of `gnd.gnd_map.codec.encode_measured`: what it met there."""
+    measured: bytes = b""
+    """Of `gnd.gnd_map.codec.encode_measured`: the Gaussians of all new and modified voxels; empty: they are asked
+    for."""
+    is_patient: bool = False
+    """The vehicle sends more, and hears with the ack of that that this report is released."""
 
     def __post_init__(self) -> None:
         check_report_head(self)
@@ -157,6 +162,8 @@ class PackedReport:
             course=course_message(self.course),
             unsure=self.unsure,
             unsure_measured=self.unsure_measured,
+            measured=self.measured,
+            is_patient=self.is_patient,
         )
         message = change_report_pb2.ChangeReport(major=MAJOR, packed=packed)
         return serialise(message, limits.MAX_PACKED_REPORT_BYTES)
@@ -261,6 +268,8 @@ def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
         course=course_value(message.course) if message.HasField("course") else None,
         unsure=message.unsure,
         unsure_measured=message.unsure_measured,
+        measured=message.measured,
+        is_patient=message.is_patient,
     )
 
 

@@ -75,7 +75,7 @@ class ReportStates:
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ReportStates."""
-        message = report_states_pb2.ReportStates(major=MAJOR, states=map(_message, self.states))
+        message = report_states_pb2.ReportStates(major=MAJOR, states=map(state_message, self.states))
         return serialise(message, limits.MAX_REPORT_STATES_BYTES)
 
     @classmethod
@@ -85,7 +85,7 @@ class ReportStates:
         most = limits.MAX_REPORTS_OF_QUESTION + 16
         message = parse(kind, data, limits.MAX_REPORT_STATES_BYTES, max_fields=most)
         check_major(message, "ReportStates")
-        return cls(tuple(map(_value, message.states)))
+        return cls(tuple(map(state_value, message.states)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,8 @@ def _check_count(name: str, count: int) -> None:
         raise BadValue(f"{name} is about {count} reports, expected 1 to {limits.MAX_REPORTS_OF_QUESTION}")
 
 
-def _message(state: ReportState) -> report_state_pb2.ReportState:
+def state_message(state: ReportState) -> report_state_pb2.ReportState:
+    """A state as messages carry it."""
     message = report_state_pb2.ReportState(
         report_id=bytes_of_report_id(state.report_id), wanted=state.wanted, reason=state.reason
     )
@@ -126,7 +127,8 @@ def _message(state: ReportState) -> report_state_pb2.ReportState:
     return message
 
 
-def _value(message: report_state_pb2.ReportState) -> ReportState:
+def state_value(message: report_state_pb2.ReportState) -> ReportState:
+    """The state in a message; `SchemaError` when it is none."""
     return ReportState(
         report_id=report_id_of_bytes(message.report_id),
         status=word_of(message.status, _STATUS, "ReportState status"),

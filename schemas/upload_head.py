@@ -1,6 +1,6 @@
 """What the outside of an upload says, without reading what it holds: enough to keep it and to answer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from gnd.gnd_map.tile_id import District
@@ -40,6 +40,7 @@ class UploadHead:
         vehicle: pseudonym; "" of Gaussians, which do not tell it.
         last_ns: time of the last scan that it rests on, UTC; 0 of Gaussians.
         place: (layer, district) that it names itself; None where only its key does.
+        is_patient: whether word that it is released may wait for the ack of the next one.
     """
 
     form: UploadForm
@@ -47,6 +48,7 @@ class UploadHead:
     vehicle: str = ""
     last_ns: int = 0
     place: tuple[str, District] | None = None
+    is_patient: bool = False
 
 
 def head_of_upload(data: bytes) -> UploadHead:
@@ -75,7 +77,9 @@ def head_of_upload(data: bytes) -> UploadHead:
     if form == "gaussians":
         return UploadHead(form, report_id_of_bytes(message.gaussians.report_id))
     if form == "packed":
-        return _head(form, report_id_of_bytes(message.packed.report_id), message.packed, message.packed.length_ns)
+        packed = message.packed
+        head = _head(form, report_id_of_bytes(packed.report_id), packed, packed.length_ns)
+        return replace(head, is_patient=packed.is_patient)
     if form == "features":
         features = message.features
         report_id = report_id_of_bytes(features.report_id)

@@ -71,7 +71,7 @@ class DistrictShift:
 
     def packed(self, report: PackedReport, bases: Iterable[tuple[TileId, bytes]]) -> PackedReport:
         """The first half of a report in short, as its vehicle would have sent it here."""
-        return replace(report, base_digest=self.digest(bases))
+        return replace(report, base_digest=self.digest(bases), is_patient=False)  # each is waited for by itself
 
     def whole(self, report: ChangeReport) -> ChangeReport:
         """A whole report, as its vehicle would have sent it here."""

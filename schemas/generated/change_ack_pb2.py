@@ -22,17 +22,18 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from . import report_state_pb2 as gnd_dot_v1_dot_report__state__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gnd/v1/change_ack.proto\x12\x06gnd.v1\"\x81\x02\n\tChangeAck\x12\r\n\x05major\x18\x01 \x01(\r\x12\x11\n\treport_id\x18\x02 \x01(\t\x12(\n\x06status\x18\x03 \x01(\x0e\x32\x18.gnd.v1.ChangeAck.Status\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12\x0e\n\x06wanted\x18\x05 \x01(\x0c\"\x87\x01\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x11\n\rSTATUS_STORED\x10\x01\x12\x14\n\x10STATUS_DUPLICATE\x10\x02\x12\x16\n\x12STATUS_QUARANTINED\x10\x03\x12\x11\n\rSTATUS_WANTED\x10\x04\x12\x11\n\rSTATUS_RESEND\x10\x05\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gnd/v1/change_ack.proto\x12\x06gnd.v1\x1a\x19gnd/v1/report_state.proto\"\xa4\x02\n\tChangeAck\x12\r\n\x05major\x18\x01 \x01(\r\x12\x11\n\treport_id\x18\x02 \x01(\t\x12(\n\x06status\x18\x03 \x01(\x0e\x32\x18.gnd.v1.ChangeAck.Status\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12\x0e\n\x06wanted\x18\x05 \x01(\x0c\x12!\n\x04told\x18\x06 \x03(\x0b\x32\x13.gnd.v1.ReportState\"\x87\x01\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x11\n\rSTATUS_STORED\x10\x01\x12\x14\n\x10STATUS_DUPLICATE\x10\x02\x12\x16\n\x12STATUS_QUARANTINED\x10\x03\x12\x11\n\rSTATUS_WANTED\x10\x04\x12\x11\n\rSTATUS_RESEND\x10\x05\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.change_ack_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_CHANGEACK']._serialized_start=36
-  _globals['_CHANGEACK']._serialized_end=293
-  _globals['_CHANGEACK_STATUS']._serialized_start=158
-  _globals['_CHANGEACK_STATUS']._serialized_end=293
+  _globals['_CHANGEACK']._serialized_start=63
+  _globals['_CHANGEACK']._serialized_end=355
+  _globals['_CHANGEACK_STATUS']._serialized_start=220
+  _globals['_CHANGEACK_STATUS']._serialized_end=355
 # @@protoc_insertion_point(module_scope)

@@ -3,8 +3,11 @@
 isort:skip_file
 """
 
+from collections import abc as _abc
+from . import report_state_pb2 as _report_state_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
+from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 import builtins as _builtins
 import sys
@@ -63,6 +66,7 @@ class ChangeAck(_message.Message):
     STATUS_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
     WANTED_FIELD_NUMBER: _builtins.int
+    TOLD_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     report_id: _builtins.str
@@ -74,6 +78,10 @@ class ChangeAck(_message.Message):
     """Set exactly when status = STATUS_WANTED: which of the new and modified voxels of the report, in order of tile and
     voxel id, the merger wants Gaussians of; coded as gnd_map.codec.encode_mask.
     """
+    @_builtins.property
+    def told(self) -> _containers.RepeatedCompositeFieldContainer[_report_state_pb2.ReportState]:
+        """How far earlier reports of the same vehicle have come that were patient, as ReportStates tells it; at most 16."""
+
     def __init__(
         self,
         *,
@@ -82,10 +90,11 @@ class ChangeAck(_message.Message):
         status: Global___ChangeAck.Status.ValueType = ...,
         reason: _builtins.str = ...,
         wanted: _builtins.bytes = ...,
+        told: _abc.Iterable[_report_state_pb2.ReportState] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["major", b"major", "reason", b"reason", "report_id", b"report_id", "status", b"status", "wanted", b"wanted"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["major", b"major", "reason", b"reason", "report_id", b"report_id", "status", b"status", "told", b"told", "wanted", b"wanted"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -23,7 +23,8 @@ DESCRIPTOR: _descriptor.FileDescriptor
 @_typing.final
 class PackedReport(_message.Message):
     """A change report in short: flags of what changed, coded against the base that both sides hold, and where the vehicle
-    was instead of which voxels it has observed. The Gaussians follow in PackedGaussians, those that the ack asks for.
+    was instead of which voxels it has observed. The Gaussians follow in PackedGaussians, those that are asked for, unless
+    they are so few that they come along.
     Layer and district are those of the key.
     """
 
@@ -46,6 +47,8 @@ class PackedReport(_message.Message):
     COURSE_FIELD_NUMBER: _builtins.int
     UNSURE_FIELD_NUMBER: _builtins.int
     UNSURE_MEASURED_FIELD_NUMBER: _builtins.int
+    MEASURED_FIELD_NUMBER: _builtins.int
+    IS_PATIENT_FIELD_NUMBER: _builtins.int
     report_id: _builtins.bytes
     """The report's ULID as 16 bytes."""
     vehicle: _builtins.str
@@ -87,6 +90,15 @@ class PackedReport(_message.Message):
     """What the vehicle measured in them: coded as gnd_map.codec.encode_measured; of those tiles only that have any. The
     number of points is that of the 10 cm sub-cells that half as many points would have met. [1 .. 19]
     """
+    measured: _builtins.bytes
+    """The Gaussians of all voxels that `flags` calls new or modified, where they are so few that to be asked for them would
+    cost more: coded as PackedGaussians.measured. Absent = the merger asks for those that it wants. A reader that does not
+    know this field asks for them, too.
+    """
+    is_patient: _builtins.bool
+    """The vehicle sends more, and hears that this report is released with the ack of that: word of it may wait for some
+    90 s. A merger that does not know this field tells it at once.
+    """
     @_builtins.property
     def doubtful(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """Which of the tiles are doubtful: indices in the district, ascending, all among `tiles`. A tile of which something is
@@ -121,10 +133,12 @@ class PackedReport(_message.Message):
         course: _course_pb2.Course | None = ...,
         unsure: _builtins.bytes = ...,
         unsure_measured: _builtins.bytes = ...,
+        measured: _builtins.bytes = ...,
+        is_patient: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["course", b"course"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "course", b"course", "doubtful", b"doubtful", "doubts", b"doubts", "first_ns", b"first_ns", "flags", b"flags", "length_ns", b"length_ns", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "unsure", b"unsure", "unsure_measured", b"unsure_measured", "vehicle", b"vehicle"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "course", b"course", "doubtful", b"doubtful", "doubts", b"doubts", "first_ns", b"first_ns", "flags", b"flags", "is_patient", b"is_patient", "length_ns", b"length_ns", "measured", b"measured", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "unsure", b"unsure", "unsure_measured", b"unsure_measured", "vehicle", b"vehicle"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -153,6 +153,8 @@ class _StudyCloud:
         whole, packed = ChangeReport.decode(body), PackedReport.decode(half)
         tiles = [self._tile(tile, version) for tile, version in base_versions(packed, whole.district)]
         expanded = expand(packed, whole.layer, whole.district, tiles)
+        if packed.measured:
+            return expanded, 0
         mask = self._wanted(expanded)
         if not mask.any():
             return expanded, 0

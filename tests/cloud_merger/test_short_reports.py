@@ -95,6 +95,47 @@ def test_flags_count_at_once_and_both_halves_say_what_the_whole_report_says_to_t
     assert (whole.first_ns, whole.last_ns) == (REPORT.first_ns, REPORT.last_ns)
 
 
+ALL_OF_IT = pack(REPORT, bases_of(REPORT), track_by(), at_once_bytes=10_000)
+"""The same report, its Gaussians beside the flags."""
+
+
+def test_gaussians_that_come_with_the_flags_are_not_asked_for_and_count_like_those_that_were(tmp_path):
+    kept = []
+    for number, payloads in enumerate(((PACKED,), (ALL_OF_IT.encode(),))):
+        with SqliteStore(tmp_path / f"{number}.sqlite") as store:
+            store.put_tiles([tile_at()])
+            desk = Desk(store)
+            told = [desk.send(KEY, payload) for payload in payloads]
+            if told[0].status == "wanted":
+                told.append(desk.send(KEY, second_half(REPORT, told[0])))
+            assert [one.status for one in told] == (["released"] if number else ["wanted", "released"])
+            kept.append(stored(store)[TILE])
+            assert [row.is_half for row in store.reports()] == ([False] if number else [True, False])
+    of_halves, at_once = kept
+    assert at_once.changed == of_halves.changed == REPORT.tiles[0].changed
+    assert at_once.observed.tolist() == of_halves.observed.tolist()
+    assert at_once.change_class.tolist() == of_halves.change_class.tolist()
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda m: m[:-1], lambda m: m + b"\0", lambda m: b"\xff" * len(m), lambda _m: b"\0"]
+)
+def test_gaussians_beside_the_flags_that_cannot_be_read_are_named_and_the_report_follows_whole(store, desk, damage):
+    bad = dataclasses.replace(ALL_OF_IT, measured=damage(ALL_OF_IT.measured)).encode()
+    told = desk.send(KEY, bad)
+    assert (told.status, told.reason.split(":")[0]) == ("quarantined", "BadReport")
+    assert not store.reports()
+    assert desk.send(KEY, REPORT.encode()).status == "released"
+    assert stored(store)[TILE].changed == REPORT.tiles[0].changed
+
+
+def test_gaussians_beside_flags_that_name_none_are_refused(store, desk):
+    bare = pack(drive_number(2, deleted=(2,)), bases_of(REPORT), track_by())
+    told = desk.send(KEY, dataclasses.replace(bare, measured=ALL_OF_IT.measured).encode())
+    assert told.status == "quarantined"
+    assert not store.reports()
+
+
 def test_where_nothing_is_wanted_the_flags_alone_are_stored_and_gaussians_withheld(store):
     desk = Desk(store, want=WantParameters(enough=0))
     assert desk.send(KEY, PACKED).status == "released"

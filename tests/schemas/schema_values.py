@@ -20,6 +20,7 @@ from gnd.schemas.course import Course
 from gnd.schemas.doubt import Doubt, DoubtReason
 from gnd.schemas.packed import PackedGaussians, PackedReport, digest_of
 from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportState
 from gnd.schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.traffic import TrafficLine, TrafficSample
@@ -203,6 +204,9 @@ GOLDEN: dict[str, Any] = {
     "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
     "ChangeAck-wanted": ChangeAck(REPORT_ID, "wanted", wanted=b"not looked into"),
+    "ChangeAck-told": ChangeAck(
+        REPORT_ID, "stored", told=(ReportState(deterministic_report_id(1_700_000_000_000, "before"), "released"),)
+    ),
     "ChangeAck-resend": ChangeAck(REPORT_ID, "resend", "tile 13033/03021/23031/22102 has no version 9 here"),
     "PackedReport-three_tiles": PackedReport(
         report_id=REPORT_ID,
@@ -217,6 +221,22 @@ GOLDEN: dict[str, Any] = {
         track=b"nor this",
         pose_sigma_tenth_mm=312,
         pose_sigma_10urad=107,
+    ),
+    "PackedReport-measured": PackedReport(
+        report_id=REPORT_ID,
+        vehicle="car-1",
+        sensor_model="VLP-16",
+        software="gnd-fleet 0.1.0",
+        first_ns=1_700_000_000_000_000_000,
+        length_ns=1,
+        tiles=((274, 3),),
+        base_digest=SHA[:8],
+        flags=b"not looked into",
+        track=b"nor this",
+        pose_sigma_tenth_mm=812,
+        pose_sigma_10urad=87,
+        measured=b"Gaussians",
+        is_patient=True,
     ),
     "PackedReport-unsure": PackedReport(
         report_id=REPORT_ID,

@@ -14,9 +14,10 @@ from gnd.schemas import limits
 from gnd.schemas.changes import ChangeAck, ChangeReport
 from gnd.schemas.course import Course
 from gnd.schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
-from gnd.schemas.generated import change_report_pb2
+from gnd.schemas.generated import change_ack_pb2, change_report_pb2, report_state_pb2
 from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload, digest_of
 from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportState, state_message
 
 
 def packed(**values: Any) -> PackedReport:
@@ -51,6 +52,8 @@ def any_packed(draw: Any) -> PackedReport:
         doubts=tuple((index, draw(any_doubt())) for index in doubtful),
         course=draw(st.none() | st.builds(Course, st.integers(-314_160, 314_160), st.integers(1, 314_160))),
         **draw(st.sampled_from([{}, {"unsure": b"voxels", "unsure_measured": b"what was met"}])),
+        measured=draw(st.binary(max_size=60)),
+        is_patient=draw(st.booleans()),
     )
 
 
@@ -174,6 +177,27 @@ def test_an_ack_asks_if_and_only_if_it_says_for_what() -> None:
         ChangeAck(REPORT_ID, "wanted", wanted=bytes(limits.MAX_WANTED_BYTES + 1))
     with pytest.raises(BadValue, match="report id"):
         ChangeAck("", "resend")
+
+
+def test_an_ack_tells_of_earlier_reports_and_of_no_more_than_a_vehicle_reads() -> None:
+    told = tuple(
+        ReportState(deterministic_report_id(1, "v", str(n)), "released") for n in range(limits.MAX_STATES_OF_ACK + 1)
+    )
+    ack = ChangeAck(REPORT_ID, "stored", told=told[:-1])
+    assert ChangeAck.decode(ack.encode()) == ack
+    assert (
+        len(ChangeAck(REPORT_ID, "stored", told=told[:1]).encode()) - len(ChangeAck(REPORT_ID, "stored").encode()) == 22
+    )
+    with pytest.raises(TooLarge, match="17 states of reports"):
+        ChangeAck(REPORT_ID, "stored", told=told)
+    many = change_ack_pb2.ChangeAck.FromString(ack.encode())
+    many.told.append(state_message(told[-1]))
+    with pytest.raises(TooLarge, match="17 states of reports"):
+        ChangeAck.decode(many.SerializeToString())
+    many.told[0].status = report_state_pb2.ReportState.Status.STATUS_UNSPECIFIED
+    del many.told[-1]
+    with pytest.raises(BadValue, match="ReportState status"):
+        ChangeAck.decode(many.SerializeToString())
 
 
 def test_a_flagged_district_costs_less_than_a_hundred_bytes_beside_flags_and_track() -> None:

@@ -19,6 +19,7 @@ from gnd.schemas.changes import ChangeReport
 from gnd.schemas.course import Course
 from gnd.schemas.doubt import Doubt, DoubtReason
 from gnd.schemas.packed import PackedReport, decode_upload, digest_of
+from gnd.schemas.upload_head import head_of_upload
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.errors import AgentConfigError, PackingError
@@ -28,7 +29,7 @@ from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.pipeline import known_course
-from gnd.vehicle_agent.report.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
+from gnd.vehicle_agent.report.packing import AT_ONCE_BYTES, Bases, askable, asked_for, is_measured, pack, pack_measured
 from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment import SegmentedScan
 
@@ -100,6 +101,28 @@ def test_a_reporter_puts_the_short_form_beside_the_whole_one(
     assert 0 <= packed.pose_sigma_m - max(c.pose_sigma_m for c in report.tiles) <= 1e-4
     assert 0 <= packed.pose_sigma_rad - max(c.pose_sigma_rad for c in report.tiles) <= 1e-5
     assert len(letter.packed) < len(letter.body) / 10
+
+
+def test_a_few_gaussians_come_with_the_flags_and_many_wait_to_be_asked_for(
+    report: ChangeReport, bases: Bases, letter: Letter
+) -> None:
+    track = decode_track(report.district, PackedReport.decode(letter.packed).track)
+    every = pack_measured(report, bases, encode_mask(np.ones(askable(report), np.bool_))).measured
+    assert PackedReport.decode(letter.packed).measured == (every if len(every) <= AT_ONCE_BYTES else b"")
+    for most_bytes, measured in ((0, b""), (len(every) - 1, b""), (len(every), every)):
+        assert pack(report, bases, track, most_bytes).measured == measured
+
+
+@pytest.mark.parametrize(
+    ("is_last", "most_bytes", "is_patient"), [(False, 0, False), (False, 10_000, True), (True, 10_000, False)]
+)
+def test_only_who_sends_more_and_has_nothing_to_be_asked_for_is_patient(
+    report: ChangeReport, bases: Bases, letter: Letter, is_last: bool, most_bytes: int, is_patient: bool
+) -> None:
+    track = decode_track(report.district, PackedReport.decode(letter.packed).track)
+    packed = pack(report, bases, track, most_bytes, is_last=is_last)
+    assert packed.is_patient == head_of_upload(packed.encode()).is_patient == is_patient
+    assert not PackedReport.decode(letter.packed).is_patient, "the drive had ended"
 
 
 def test_every_gaussian_that_a_report_holds_can_travel_in_short(report: ChangeReport) -> None:

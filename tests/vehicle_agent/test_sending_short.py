@@ -5,6 +5,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,8 +27,8 @@ from gnd.schemas.changes import ChangeAck, ChangeReport, TileChange
 from gnd.schemas.keys import change_key, change_keys, state_keys, want_key
 from gnd.schemas.packed import PackedGaussians, PackedReport, decode_upload
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.schemas.report_states import ReportState, ReportStates, ReportStatus
-from gnd.vehicle_agent.link.outbox import Outbox, OutboxCounts
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates, ReportStatus
+from gnd.vehicle_agent.link.outbox import FIRST_ASK_S, PATIENT_ASK_S, Outbox, OutboxCounts
 from gnd.vehicle_agent.link.sending import SenderThread
 from gnd.vehicle_agent.report.packing import pack
 
@@ -157,6 +158,79 @@ def test_the_gaussians_that_are_asked_for_follow_and_no_others(
     expected = report.tiles[0].changed.take(mask)
     assert decode_measured([(tile.tile_id, tile.gaussians, expected.voxel_id)], second.measured) == [expected]
     assert outbox.counts().acknowledged == 1
+
+
+def packed_with(tile: Tile, report: ChangeReport, *, is_last: bool) -> bytes:
+    """The report in short with all its Gaussians."""
+    view = TrackView((-30, -24, -18, -12, -6, 0, 6, 12, 20))
+    track = Track(report.district, view, (TrackPiece(np.zeros((1, 3), np.int32), 5),))
+    return pack(report, {tile.sha: tile.gaussians}, track, 1 << 20, is_last=is_last).encode()
+
+
+def test_a_merger_of_before_asks_for_gaussians_that_it_did_not_see_and_gets_them(
+    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport, tile: Tile
+) -> None:
+    outbox._db.run("UPDATE packed SET body = ?", (packed_with(tile, report, is_last=True),))
+    run(start, cloud, script := Script(cloud, told("wanted", encode_mask(some(report))), told("released")))
+    assert script.kinds == ["PackedReport", "PackedGaussians"]
+    assert outbox.counts().acknowledged == 1
+
+
+def number_two(report: ChangeReport) -> ChangeReport:
+    return dataclasses.replace(report, report_id=deterministic_report_id(1_570_838_400_001, "vehicle", "2"))
+
+
+def test_word_of_a_patient_report_comes_with_the_ack_of_the_next_and_is_not_asked_for_meanwhile(
+    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport, tile: Tile
+) -> None:
+    outbox._db.run("UPDATE packed SET body = ?", (packed_with(tile, report, is_last=False),))
+    other, asked = number_two(report), []
+
+    def answer(request: Request) -> bytes:
+        upload = decode_upload(request.payload)
+        if upload.report_id == REPORT_ID:
+            return ChangeAck(REPORT_ID, "stored").encode()
+        released = tuple(ReportState(one, "released") for one in (REPORT_ID, upload.report_id))
+        cloud.publish(want_key("vehicle"), ReportStates(released[1:]).encode(), kind="ack")
+        return ChangeAck(upload.report_id, "stored", told=released[:1]).encode()
+
+    def state(request: Request) -> bytes:
+        asked.extend(ReportQuestion.decode(request.payload).report_ids)
+        return ReportStates(tuple(ReportState(one, "released") for one in asked)).encode()
+
+    cloud.serve(change_keys(), answer, workers=1)
+    cloud.serve(state_keys(), state)
+    sender = start()
+    wait_until(lambda: outbox.counts().held)
+    time.sleep(FIRST_ASK_S + 1.0)
+    assert (outbox.counts().held, asked) == (1, []), "a vehicle that is told at once asks after 4 s"
+    outbox.put(other.report_id, change_key("ndt", report.district), other.encode())
+    wait_until(lambda: outbox.states()[REPORT_ID] == "released")
+    assert outbox.bases_of(REPORT_ID) == {}
+    assert sender.drain(20.0, NEVER)
+    assert REPORT_ID not in asked
+
+
+def test_the_end_of_a_drive_does_not_wait_for_an_ack_that_will_not_come(
+    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport, tile: Tile
+) -> None:
+    outbox._db.run("UPDATE packed SET body = ?", (packed_with(tile, report, is_last=False),))
+    cloud.serve(change_keys(), lambda _: ChangeAck(REPORT_ID, "stored").encode(), workers=1)
+    cloud.serve(state_keys(), lambda _: ReportStates((told("released"),)).encode())
+    sender = start()
+    wait_until(lambda: outbox.counts().held)
+    assert sender.drain(PATIENT_ASK_S / 4, NEVER)
+    assert outbox.states() == {REPORT_ID: "released"}
+
+
+def test_word_in_an_ack_about_a_report_that_is_not_here_changes_nothing(
+    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
+) -> None:
+    stranger = ReportState(number_two(report).report_id, "quarantined", reason="no")
+    cloud.serve(change_keys(), lambda _: ChangeAck(REPORT_ID, "stored", told=(stranger,)).encode(), workers=1)
+    cloud.serve(state_keys(), lambda _: ReportStates((told("released"),)).encode())
+    assert start().drain(20.0, NEVER)
+    assert outbox.states() == {REPORT_ID: "released"}
 
 
 def test_gaussians_are_made_long_after_the_ack_of_their_flags(

@@ -83,6 +83,9 @@ _CODECS = (CODEC_STANDARD_ZSTD, CODEC_FLOAT32_ZSTD)  # quick, and the second can
 ANSWERS = ("stored", "duplicate", "quarantined")
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 15.0
 FIRST_ASK_S, LONGEST_ASK_S = 4.0, 60.0
+PATIENT_ASK_S: Final = 120.0
+"""Where word may wait for the ack of the next report: longer than a merger keeps it (`cloud_merger.patience`)."""
+HURRY_S: Final = 2.0
 MAX_ANSWERS: Final = 3  # so often the same Gaussians are asked for; then the report goes whole
 
 
@@ -185,10 +188,11 @@ class Outbox:
         wanted: bytes = b"",
         *,
         is_short: bool = False,
+        ask_s: float = FIRST_ASK_S,
     ) -> None:
         """Record what came to a message: `stored` or `duplicate` (acknowledged), or `quarantined` with its reason.
 
-        An acknowledged report is held: word of it is waited for, and some seconds after `now_ns` `unheard` names it.
+        An acknowledged report is held: word of it is waited for, and `ask_s` after `now_ns` `unheard` names it.
         What is refused is done with.
 
         Args:
@@ -198,6 +202,7 @@ class Outbox:
             now_ns: the time.
             wanted: the mask that the message has answered; empty: it held no Gaussians that were asked for.
             is_short: whether the message was a half: its ack says nothing once the report is to go whole.
+            ask_s: when to ask after it, s.
         """
         if status not in ANSWERS:
             raise OutboxError(f"report {report_id}: unknown answer {status!r}, expected one of {', '.join(ANSWERS)}")
@@ -212,7 +217,7 @@ class Outbox:
                 " WHERE report_id = ?3 AND state IN ('pending', 'stored')"
                 " AND (NOT ?4 OR report_id IN (SELECT report_id FROM packed))"
             )
-            c.execute(sql, (wanted, now_ns + int(FIRST_ASK_S * 1e9), report_id, is_short))
+            c.execute(sql, (wanted, now_ns + int(ask_s * 1e9), report_id, is_short))
 
     def told(self, state: ReportState, now_ns: int) -> None:
         """Record how far the cloud says that a report has come; of one that is not here, or done with, nothing.
@@ -241,6 +246,11 @@ class Outbox:
         )
         rows = [(now_ns, int(LONGEST_ASK_S), int(FIRST_ASK_S), report_id) for report_id in report_ids]
         self._db.run_many(sql, rows)
+
+    def ask_soon(self, now_ns: int) -> None:
+        """Ask after those within `HURRY_S` of which word was to come later: no report follows whose ack brings it."""
+        sql = "UPDATE report SET next_ns = ? WHERE state = 'stored' AND wanted = x'' AND next_ns > ?"
+        self._db.run(sql, (now_ns + int(HURRY_S * 1e9), now_ns + int(LONGEST_ASK_S * 1e9)))
 
     def send_whole(self, report_id: str, reason: str) -> None:
         """Give up the short form of a report: it goes whole, at once."""

@@ -1,7 +1,8 @@
 """The thread that empties the outbox: each report is sent until it is acknowledged, and kept until it is released.
 
 A report in short goes in two messages: its flags, and then the Gaussians that the cloud asks for. It asks on the
-vehicle's own key once it has looked at the flags; where no word comes, the vehicle asks after its reports. Where the
+vehicle's own key once it has looked at the flags; where no word comes, the vehicle asks after its reports. A few
+Gaussians come with the flags, and word that such a report is released with the ack of the next one. Where the
 cloud cannot make sense of the short form, for whatever reason, the whole report follows: only what is refused whole is
 refused.
 """
@@ -20,8 +21,9 @@ from gnd.schemas.changes import ChangeAck, ChangeReport
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.keys import state_key, want_key
 from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
+from gnd.schemas.upload_head import head_of_upload
 from gnd.vehicle_agent.errors import PackingError
-from gnd.vehicle_agent.link.outbox import ANSWERS, Letter, Outbox
+from gnd.vehicle_agent.link.outbox import ANSWERS, FIRST_ASK_S, PATIENT_ASK_S, Letter, Outbox
 from gnd.vehicle_agent.report.packing import pack_measured
 
 POLL_S = 0.2
@@ -55,8 +57,11 @@ class SenderThread:
 
     def drain(self, timeout_s: float, stop: threading.Event) -> bool:
         """Wait until all is released or refused; False when time is up or `stop` is set."""
-        deadline_s = time.monotonic() + timeout_s
-        while self._outbox.counts().open:
+        deadline_s, asks_soon = time.monotonic() + timeout_s, False
+        while (counts := self._outbox.counts()).open:
+            if not counts.pending and not asks_soon:
+                asks_soon = True
+                self._outbox.ask_soon(time.monotonic_ns())
             if time.monotonic() > deadline_s or stop.wait(POLL_S):
                 return False
         return True
@@ -128,13 +133,22 @@ class SenderThread:
             raise SchemaError(f"report {letter.report_id} was answered for report {ack.report_id}")
         if form == "whole" and ack.status not in ANSWERS:
             raise SchemaError(f"report {letter.report_id} was sent whole and answered {ack.status!r}")
+        for state in ack.told:
+            self._outbox.told(state, time.monotonic_ns())
         if ack.status == "wanted":
             self._outbox.told(ReportState(letter.report_id, "wanted", ack.wanted), time.monotonic_ns())
         elif ack.status in ("quarantined", "resend"):
             self._refused(letter, ack.reason)
         else:
-            now_ns, is_short = time.monotonic_ns(), form != "whole"
-            self._outbox.answered(letter.report_id, ack.status, now_ns=now_ns, wanted=letter.wanted, is_short=is_short)
+            is_patient = form == "flags" and head_of_upload(letter.packed).is_patient
+            self._outbox.answered(
+                letter.report_id,
+                ack.status,
+                now_ns=time.monotonic_ns(),
+                wanted=letter.wanted,
+                is_short=form != "whole",
+                ask_s=PATIENT_ASK_S if is_patient else FIRST_ASK_S,
+            )
 
     def _refused(self, letter: Letter, reason: str) -> None:
         """Only a whole report is refused for good."""

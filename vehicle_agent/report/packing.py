@@ -6,6 +6,7 @@ same bytes again, and a study of the traffic can pack without a bus. `gnd.cloud_
 
 import math
 from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,16 @@ from gnd.vehicle_agent.errors import PackingError
 Bases = Mapping[bytes, Gaussians]
 """The Gaussians of base tiles by content hash; b"" (the vehicle had no map of the tile) need not be among them."""
 
+AT_ONCE_BYTES: Final = 256
+"""Gaussians of so many bytes come with the flags. To be asked for them takes a word, a message and its answer: some
+500 B plain, 600 B with TLS and seals, beside what they hold (`python -m studies identity-bytes`)."""
 _STEPS_PER_M = 10_000
 _STEPS_PER_RAD = 100_000
 
 
-def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
+def pack(
+    report: ChangeReport, bases: Bases, track: Track, at_once_bytes: int = 0, *, is_last: bool = True
+) -> PackedReport:
     """The first half of `report`: which voxels it flags, and where the vehicle was.
 
     Args:
@@ -36,6 +42,9 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
             not sent.
         bases: at least those that the report's tiles name.
         track: where the vehicle was while the scans counted that the report rests on.
+        at_once_bytes: all Gaussians come along where they have no more bytes than that.
+        is_last: no report follows soon: word of this one is not to wait for the next one's ack. Where Gaussians are yet
+            to be asked for it does not wait, either.
 
     Raises:
         PackingError: a base is missing, a changed voxel is of another class, something is held back, or the track is
@@ -50,6 +59,7 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         raise PackingError(f"report {report.report_id} holds changes back: the track would call them observed")
     unsure = [(change.tile, base_of(change, bases), change.unsure) for change in report.tiles]
     is_unsure = any(len(measured) for _, _, measured in unsure)
+    measured = _all_measured(report, bases, at_once_bytes)
     return PackedReport(
         report_id=report.report_id,
         vehicle=report.vehicle,
@@ -69,7 +79,18 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         course=report.course,
         unsure=encode_flags([_new(*one) for one in unsure]) if is_unsure else b"",
         unsure_measured=encode_measured([one for one in unsure if len(one[2])]) if is_unsure else b"",
+        measured=measured,
+        is_patient=not is_last and (bool(measured) or not askable(report)),
     )
+
+
+def _all_measured(report: ChangeReport, bases: Bases, most_bytes: int) -> bytes:
+    """The Gaussians of all new and modified voxels; empty where they have more bytes than that."""
+    n = askable(report)
+    if not 0 < n <= most_bytes:  # none has less than a byte
+        return b""
+    measured = encode_measured(asked_for(report, bases, np.ones(n, np.bool_)))
+    return measured if len(measured) <= most_bytes else b""
 
 
 def pack_measured(report: ChangeReport, bases: Bases, wanted: bytes) -> PackedGaussians:

@@ -44,7 +44,7 @@ from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise.level import sees_tilt
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.report.packing import is_measured, pack
+from gnd.vehicle_agent.report.packing import AT_ONCE_BYTES, is_measured, pack
 from gnd.vehicle_agent.report.sink import ReportSink
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from gnd.vehicle_agent.surroundings import left_behind
@@ -188,6 +188,7 @@ class Reporter:
         self._statement = statement or statement_on_lattice
         self._pending: dict[District, _PendingTiles] = {}
         self._numbers: Counter[District] = Counter()
+        self._has_ended = False
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
         self._here_ns = start_ns  # time of the newest final pose
@@ -294,6 +295,7 @@ class Reporter:
 
     def report_all(self, odometer_m: float) -> None:
         """The drive has ended: decide and report everything."""
+        self._has_ended = True
         for one in self._trial.flush():
             self._count(one)
         self._hear_trial()
@@ -416,7 +418,7 @@ class Reporter:
             if self._parameters.protocol == "full":
                 return b""
             of_sha = {c.base_sha: bases[c.tile].gaussians for c in report.tiles if c.base_sha}
-            return pack(report, of_sha, track).encode()
+            return pack(report, of_sha, track, AT_ONCE_BYTES, is_last=self._has_ended).encode()
         except GndError as error:
             self.counts["reports_not_packed"] += 1
             _log.warning("report %s can only be sent whole: %s", report.report_id, error)
