@@ -167,7 +167,7 @@ class Serving(Part):
             self._refuse(query, key, str(refusal), heard, attachment)
             return
         if isinstance(answer, bytes):
-            self._send(query, request.key, answer, heard)
+            self._send(query, request.key, answer, heard, is_all=True)
             return
         heard = replace(heard, share=b"")
         count = 0
@@ -191,7 +191,9 @@ class Serving(Part):
         with self._connection.sending():
             query.reply(key, payload, attachment=seal)
 
-    def _send(self, query: zenoh.Query, key: str, payload: bytes, heard: HeardQuestion) -> None:
+    def _send(
+        self, query: zenoh.Query, key: str, payload: bytes, heard: HeardQuestion, *, is_all: bool = False
+    ) -> None:
         if "*" in key:
             raise BusError(f"an answer needs a key without wildcards, got {key}: give (key, payload) pairs")
         sealing = self._connection.sealing
@@ -199,6 +201,8 @@ class Serving(Part):
         self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES) + attachment_bytes(seal))
         with self._connection.sending():
             query.reply(key, payload, attachment=seal)
+            if is_all:  # at once: the end then mostly shares a packet, and a record of TLS, with the answer
+                query.drop()
 
 
 def _say_busy(query: zenoh.Query, busy: Busy) -> None:

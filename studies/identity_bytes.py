@@ -2,6 +2,7 @@
 
 import tempfile
 from collections import Counter
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -10,10 +11,24 @@ import numpy as np
 
 from gnd.deploy.fleet_identities import make_identities
 from studies.frame.measure import Figure
-from studies.security_study.kilometre import KILOMETRE, KILOMETRE_BEFORE, KilometreMessage, router, wired
+from studies.security_study.kilometre import (
+    KILOMETRE,
+    KILOMETRE_BEFORE,
+    KILOMETRE_IN_HALVES,
+    KilometreMessage,
+    Wired,
+    router,
+    wired,
+)
 
-TIMES: Final = 20
+TIMES: Final = 60
 _WAYS: Final = (("plain", "tcp", False), ("seals", "tcp", True), ("seals and TLS", "tls", True))
+_ONE_OF_EACH: Final = tuple({one.what: one for one in reversed(KILOMETRE_IN_HALVES)}.values())
+_KILOMETRES: Final = {
+    "a kilometre before decision 167": KILOMETRE_BEFORE,
+    "a kilometre before decision 173": KILOMETRE_IN_HALVES,
+    "a kilometre": KILOMETRE,
+}
 _NAMES: Final = {
     "question": "a question about the map and its answer",
     "report": "a report and its acknowledgement",
@@ -37,22 +52,28 @@ def run() -> list[Figure]:
     """Say each message many times over a real router: without identities, with seals alone, with TLS."""
     with tempfile.TemporaryDirectory() as folder:
         identities = make_identities(Path(folder), 1, 1)
-        costs = {name: _cost(protocol, identities, sealed=sealed) for name, protocol, sealed in _WAYS}
+        costs = _costs(identities)
     return [*_by_message(costs), *_by_kilometre(costs)]
 
 
-def _cost(protocol: str, identities: Path, *, sealed: bool) -> _Cost:
-    """What each kind of message costs beside its payload."""
-    of: dict[str, list[float]] = {what: [] for what in _NAMES}
-    with (
-        router(protocol, identities) as (port, _),
-        wired(f"{protocol}/127.0.0.1:{port}", identities if sealed else None) as parts,
-    ):
-        parts.bytes_of(KILOMETRE)  # certificates are shown, keys agreed on
+def _costs(identities: Path) -> dict[str, _Cost]:
+    """What each kind of message costs beside its payload, by kind of connection.
+
+    All take turns: how often the end of a query leaves together with the answer depends on how busy the machine is.
+    """
+    of: dict[str, dict[str, list[float]]] = {name: {what: [] for what in _NAMES} for name, _, _ in _WAYS}
+    with ExitStack() as stack:
+        ways: dict[str, Wired] = {}
+        for name, protocol, sealed in _WAYS:
+            port, _ = stack.enter_context(router(protocol, identities))
+            endpoint = f"{protocol}/127.0.0.1:{port}"
+            ways[name] = stack.enter_context(wired(endpoint, identities if sealed else None))
+            ways[name].bytes_of(KILOMETRE)  # certificates are shown, keys agreed on
         for _ in range(TIMES):
-            for one in (KILOMETRE[0], *KILOMETRE[3:5], KILOMETRE[-1]):
-                of[one.what].append(parts.bytes_of((one,)) - one.up - one.down)
-    return _Cost({what: float(np.mean(found)) for what, found in of.items()})
+            for one in _ONE_OF_EACH:
+                for name, parts in ways.items():
+                    of[name][one.what].append(parts.bytes_of((one,)) - one.up - one.down)
+    return {name: _Cost({what: float(np.mean(found)) for what, found in of[name].items()}) for name in of}
 
 
 def _by_message(costs: dict[str, _Cost]) -> list[Figure]:
@@ -66,7 +87,7 @@ def _by_message(costs: dict[str, _Cost]) -> list[Figure]:
 
 def _by_kilometre(costs: dict[str, _Cost]) -> list[Figure]:
     found = []
-    for name, said in (("a kilometre before decision 167", KILOMETRE_BEFORE), ("a kilometre", KILOMETRE)):
+    for name, said in _KILOMETRES.items():
         plain, seals, tls = (cost.kilometre(said) for cost in costs.values())
         counted = ", ".join(f"{n} x {what}" for what, n in Counter(one.what for one in said).items())
         added = f"seals add {seals - plain:.0f} B, TLS {tls - seals:.0f} B: {100 * (tls / plain - 1):+.1f} %"

@@ -14,6 +14,7 @@ import numpy as np
 from gnd.deploy.ports import claim_port
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.serving import Request
 
 What = Literal["question", "report", "word", "telemetry"]
 
@@ -33,28 +34,32 @@ class KilometreMessage:
     down: int
 
 
-ACK_BYTES: Final = 32
-_REPORTS: Final = ((183, 28), (80, 24), (195, 28), (91, 24))
-_WITH_REPORTS: Final = tuple(
+_ACK_BYTES: Final = 32
+_TOLD_BYTES: Final = 22
+"""What an ack tells of the report before."""
+_HALVES: Final = ((183, 28), (80, 24), (195, 28), (91, 24))
+_IN_HALVES: Final = tuple(
     one
-    for up, down in _REPORTS
-    for one in (KilometreMessage("report", up, ACK_BYTES), KilometreMessage("word", 0, down))
+    for up, down in _HALVES
+    for one in (KilometreMessage("report", up, _ACK_BYTES), KilometreMessage("word", 0, down))
 )
+_AT_ONCE: Final = tuple(KilometreMessage("report", up, _ACK_BYTES + _TOLD_BYTES) for up in (240, 263))
+"""The same reports with their Gaussians, 51 and 62 bytes: 3 of 6 bytes in front of them say that they are there, 3 that
+the vehicle is patient."""
+_QUESTIONS: Final = tuple(KilometreMessage("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6)))
 _TELEMETRY: Final = (KilometreMessage("telemetry", 62, 0), KilometreMessage("telemetry", 159, 0))
-KILOMETRE: Final = (
-    *(KilometreMessage("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6))),
-    *_WITH_REPORTS,
-    *_TELEMETRY,
-)
+KILOMETRE: Final = (*_QUESTIONS, *_AT_ONCE, *_TELEMETRY)
 """Payload bytes as the ledger of `gnd reproduce steady-vehicle --length 1000 --pace 2` (seed 201) has them, without the
 report that the end of the drive makes."""
+KILOMETRE_IN_HALVES: Final = (*_QUESTIONS, *_IN_HALVES, *_TELEMETRY)
+"""The same where Gaussians were asked for however few they were, and each word was a message, before decision 173."""
 _ASKED_BEFORE: Final = ((70, 13), (46, 6), (42, 6), (66, 9), (35, 5), (34, 5), (36, 5), (33, 5), (39, 5))
 KILOMETRE_BEFORE: Final = (
     *(KilometreMessage("question", up, down) for up, down in _ASKED_BEFORE),
-    *_WITH_REPORTS,
+    *_IN_HALVES,
     *_TELEMETRY,
 )
-"""The same where tiles on no map were asked about one by one, before decision 167."""
+"""The same where also tiles on no map were asked about one by one, before decision 167."""
 PAUSE_S: Final = 0.3
 _ASKED: Final = "gnd/v1/tiles/ndt/13033/03021/21000"
 _REPORTED: Final = "gnd/v1/change/ndt/13033/03021/21000"
@@ -69,11 +74,15 @@ class Wired:
     shard: Bus
 
     def say(self, one: KilometreMessage) -> None:
-        """One message, with what comes back; its packets have passed when this returns."""
+        """One message, with what comes back; its packets have passed when this returns.
+
+        No keep-alives are among it: they are sent after 30 s of silence.
+        """
+        asked = one.down.to_bytes(2, "big") + bytes(max(one.up - 2, 0))  # how much is to be answered
         if one.what == "question":
-            self.vehicle.request(_ASKED, one.down.to_bytes(2, "big") + bytes(one.up - 2), kind="tile", timeout_s=20)
+            self.vehicle.request(_ASKED, asked, kind="tile", timeout_s=20)
         elif one.what == "report":
-            self.vehicle.request(_REPORTED, bytes(one.up), kind="change", timeout_s=20)
+            self.vehicle.request(_REPORTED, asked, kind="change", timeout_s=20)
         elif one.what == "word":
             self.shard.publish(_WORD, bytes(one.down), kind="ack")
         else:
@@ -89,6 +98,10 @@ class Wired:
         return after.up + after.down - before.up - before.down
 
 
+def _as_much_as_asked(request: Request) -> bytes:
+    return bytes(int.from_bytes(request.payload[:2], "big"))
+
+
 @contextmanager
 def wired(endpoint: str, identities: Path | None) -> Iterator[Wired]:
     """Parts that serve and listen at a router; `identities`: their folders, None = they have none."""
@@ -98,8 +111,8 @@ def wired(endpoint: str, identities: Path | None) -> Iterator[Wired]:
         for name in names
     )
     with open_bus(store) as tiles, open_bus(shard) as merger, open_bus(vehicle) as car:
-        tiles.serve("gnd/v1/tiles/**", lambda asked: bytes(int.from_bytes(asked.payload[:2])), complete=True)
-        merger.serve("gnd/v1/change/**", lambda _asked: bytes(ACK_BYTES), complete=True, kind="change")
+        tiles.serve("gnd/v1/tiles/**", _as_much_as_asked, complete=True)
+        merger.serve("gnd/v1/change/**", _as_much_as_asked, complete=True, kind="change")
         car.subscribe(_WORD, lambda _key, _payload: None, kind="ack")
         yield Wired(car, merger)
 

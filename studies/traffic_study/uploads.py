@@ -275,7 +275,8 @@ def _parts(messages: list[Message]) -> dict[str, int]:
         if isinstance(said, PackedReport):
             parts["flags"] += len(said.flags)
             parts["track"] += len(said.track)
-            parts["head"] += len(message.request) - len(said.flags) - len(said.track)
+            parts["gaussians"] += len(said.measured)
+            parts["head"] += len(message.request) - len(said.flags) - len(said.track) - len(said.measured)
         else:
             parts["gaussians" if isinstance(said, PackedGaussians) else "whole"] += len(message.request)
     return dict(parts)

@@ -110,7 +110,7 @@ def test_gaussians_that_come_with_the_flags_are_not_asked_for_and_count_like_tho
                 told.append(desk.send(KEY, second_half(REPORT, told[0])))
             assert [one.status for one in told] == (["released"] if number else ["wanted", "released"])
             kept.append(stored(store)[TILE])
-            assert [row.is_half for row in store.reports()] == ([False] if number else [True, False])
+            assert [row.part for row in store.reports()] == ([0] if number else [0, 1])
     of_halves, at_once = kept
     assert at_once.changed == of_halves.changed == REPORT.tiles[0].changed
     assert at_once.observed.tolist() == of_halves.observed.tolist()
@@ -124,7 +124,7 @@ def test_gaussians_beside_the_flags_that_cannot_be_read_are_named_and_the_report
     bad = dataclasses.replace(ALL_OF_IT, measured=damage(ALL_OF_IT.measured)).encode()
     told = desk.send(KEY, bad)
     assert (told.status, told.reason.split(":")[0]) == ("quarantined", "BadReport")
-    assert not store.reports()
+    assert not list(store.reports())
     assert desk.send(KEY, REPORT.encode()).status == "released"
     assert stored(store)[TILE].changed == REPORT.tiles[0].changed
 
@@ -133,7 +133,7 @@ def test_gaussians_beside_flags_that_name_none_are_refused(store, desk):
     bare = pack(drive_number(2, deleted=(2,)), bases_of(REPORT), track_by())
     told = desk.send(KEY, dataclasses.replace(bare, measured=ALL_OF_IT.measured).encode())
     assert told.status == "quarantined"
-    assert not store.reports()
+    assert not list(store.reports())
 
 
 def test_where_nothing_is_wanted_the_flags_alone_are_stored_and_gaussians_withheld(store):

@@ -16,7 +16,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.report_states import ReportState, ReportStatus
 from gnd.vehicle_agent.errors import OutboxError
-from gnd.vehicle_agent.link.outbox import MAX_ANSWERS, Outbox, OutboxCounts
+from gnd.vehicle_agent.link.outbox import MAX_ANSWERS, PATIENT_ASK_S, Outbox, OutboxCounts
 
 A, B = "01DTEXKZZZ0000000000000000", "01DTEXKZZZ0000000000000001"
 SECOND = 1_000_000_000
@@ -121,6 +121,19 @@ def test_gaussians_that_are_asked_for_again_and_again_make_the_report_go_whole(o
         outbox.answered(A, "duplicate", now_ns=8, wanted=b"mask")
     outbox.told(ReportState(A, "wanted", b"mask"), 9)
     assert [(letter.packed, letter.wanted) for letter in outbox.due(9)] == [(b"", b"")]
+
+
+def test_at_the_end_of_a_drive_patience_ends_and_pauses_between_questions_stay(outbox: Outbox) -> None:
+    for report_id in (A, B):
+        outbox.put(report_id, "key/a", b"body")
+    outbox.answered(A, "stored", now_ns=0, ask_s=PATIENT_ASK_S)
+    outbox.answered(B, "stored", now_ns=0)
+    outbox.asked([B], 69 * SECOND)
+    assert outbox.unheard(72 * SECOND) == []
+    outbox.ask_soon(70 * SECOND)  # 50 s before the first would be asked after
+    assert outbox.unheard(71 * SECOND) == []
+    assert outbox.unheard(72 * SECOND) == [A]
+    assert outbox.unheard(73 * SECOND) == [A, B]
 
 
 @pytest.mark.parametrize("status", ["waiting", "wanted", "released", "unknown", "resend", "quarantined"])

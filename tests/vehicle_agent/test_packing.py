@@ -200,7 +200,7 @@ def test_doubts_travel_in_short_by_their_tiles(report: ChangeReport, bases: Base
     track = decode_track(report.district, packed.track)
     sure = [dataclasses.replace(change, doubt=None) for change in report.tiles[:-1]]
     last = dataclasses.replace(report.tiles[-1], doubt=doubt)
-    found = pack(dataclasses.replace(report, tiles=(*sure, last)), bases, track)
+    found = pack(dataclasses.replace(report, tiles=(*sure, last)), bases, track, AT_ONCE_BYTES)
     assert found == dataclasses.replace(packed, doubts=((packed.tiles[-1][0], doubt),))
     assert PackedReport.decode(found.encode()) == found
 

@@ -249,8 +249,8 @@ class Outbox:
 
     def ask_soon(self, now_ns: int) -> None:
         """Ask after those within `HURRY_S` of which word was to come later: no report follows whose ack brings it."""
-        sql = "UPDATE report SET next_ns = ? WHERE state = 'stored' AND wanted = x'' AND next_ns > ?"
-        self._db.run(sql, (now_ns + int(HURRY_S * 1e9), now_ns + int(LONGEST_ASK_S * 1e9)))
+        sql = "UPDATE report SET next_ns = ? WHERE state = 'stored' AND wanted = x'' AND attempts = 0 AND next_ns > ?"
+        self._db.run(sql, (now_ns + int(HURRY_S * 1e9), now_ns + int(FIRST_ASK_S * 1e9)))
 
     def send_whole(self, report_id: str, reason: str) -> None:
         """Give up the short form of a report: it goes whole, at once."""

@@ -25,9 +25,10 @@ from gnd.vehicle_agent.errors import PackingError
 Bases = Mapping[bytes, Gaussians]
 """The Gaussians of base tiles by content hash; b"" (the vehicle had no map of the tile) need not be among them."""
 
-AT_ONCE_BYTES: Final = 256
+AT_ONCE_BYTES: Final = 128
 """Gaussians of so many bytes come with the flags. To be asked for them takes a word, a message and its answer: some
-500 B plain, 600 B with TLS and seals, beside what they hold (`python -m studies identity-bytes`)."""
+520 B plain, 630 B with TLS and seals, beside what they hold (`python -m studies identity-bytes`). So it pays where at
+least one such report in four would be asked."""
 _STEPS_PER_M = 10_000
 _STEPS_PER_RAD = 100_000
 
