@@ -202,7 +202,7 @@ class Serving(Part):
         with self._connection.sending():
             query.reply(key, payload, attachment=seal)
             if is_all:  # at once: the end then mostly shares a packet, and a record of TLS, with the answer
-                query.drop()
+                query.drop()  # type: ignore[no-untyped-call]  # zenoh's stub
 
 
 def _say_busy(query: zenoh.Query, busy: Busy) -> None:

@@ -27,7 +27,7 @@ Bases = Mapping[bytes, Gaussians]
 
 AT_ONCE_BYTES: Final = 128
 """Gaussians of so many bytes come with the flags. To be asked for them takes a word, a message and its answer: some
-520 B plain, 630 B with TLS and seals, beside what they hold (`python -m studies identity-bytes`). So it pays where at
+490 B plain, 590 B with TLS and seals, beside what they hold (`python -m studies identity-bytes`). So it pays where at
 least one such report in four would be asked."""
 _STEPS_PER_M = 10_000
 _STEPS_PER_RAD = 100_000
