@@ -24,7 +24,7 @@ MOST_VEHICLES: Final = 16_384
 
 
 @dataclass(slots=True)
-class _Kept:
+class _WaitingWords:
     since_s: float
     states: list[ReportState] = field(default_factory=list)
 
@@ -39,7 +39,7 @@ class PatientWords:
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s, self._lock = clock_s, threading.Lock()
         self._patient: OrderedDict[str, str] = OrderedDict()  # report id -> vehicle
-        self._kept: OrderedDict[str, _Kept] = OrderedDict()  # by vehicle, what waits longest first
+        self._kept: OrderedDict[str, _WaitingWords] = OrderedDict()  # by vehicle, what waits longest first
 
     def expect(self, vehicle: str, report_id: str) -> None:
         """A report that has just come is patient."""
@@ -58,7 +58,7 @@ class PatientWords:
             if kept is None:
                 if len(self._kept) >= MOST_VEHICLES:
                     return False
-                kept = self._kept[vehicle] = _Kept(self._clock_s())
+                kept = self._kept[vehicle] = _WaitingWords(self._clock_s())
             if len(kept.states) >= MAX_STATES_OF_ACK:
                 return False
             kept.states.append(state)
