@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,7 @@ _DISTRICT_SHIFT = 10  # the last five base-4 digits
 TILES_OF_DISTRICT = 1 << _DISTRICT_SHIFT
 _PATH = re.compile(r"[01][0-3]{4}(/[0-3]{5}){3}")
 _DISTRICT_PATH = re.compile(r"[01][0-3]{4}(/[0-3]{5}){2}")
+_CHUNKS = tuple(map("".join, product("0123", repeat=5)))
 _MAX_COVER = 1_000_000
 _SAMPLE_M = 5.0  # a corridor is covered by circles this far apart
 
@@ -183,8 +185,7 @@ class TileId:
 
 @lru_cache(maxsize=1 << 15)
 def _path_of(morton: int) -> str:
-    digits = np.base_repr(morton, 4).zfill(20)
-    return "/".join(digits[i : i + 5] for i in range(0, 20, 5))
+    return "/".join(_CHUNKS[morton >> shift & 1023] for shift in (30, 20, 10, 0))
 
 
 @dataclass(frozen=True, slots=True, order=True)

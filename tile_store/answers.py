@@ -8,6 +8,7 @@ whose base is gone or damaged, is not sent; tiles of plain floats have none. Fea
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal
 from zlib import crc32
 
@@ -189,8 +190,11 @@ class TileAnswers:
     def _check(self, stored: StoredTile) -> None:
         """StoreDamaged where the body is not what its hash says: no client could use it, and all would ask again.
 
-        It is decoded once; from then on its checksum tells whether the same bytes were read.
+        It was encoded from that content, if its check tells so. Any other, also one that is older than checks, is decoded
+        once; from then on its checksum tells whether the same bytes were read.
         """
+        if stored.is_as_encoded:
+            return
 
         def crc_of_a_whole_one() -> int:
             stored.decode()
@@ -214,9 +218,9 @@ class TileAnswers:
         """
         if stored.codec_id in FEATURE_CODECS:
             return self._only_codec(stored, codecs)
-        for codec_id in codecs:
-            if codec_id in CODECS and (lattice_of(codec_id) is None or same_lattice(codec_id, stored.codec_id)):
-                return codec_id
+        known = _codec_like(stored.codec_id, tuple(codecs))
+        if known is not None:
+            return known
         try:
             return best_codec(as_kind(self._tile(stored), Tile).gaussians, codecs)
         except GndError:
@@ -260,6 +264,15 @@ def reads_deltas(codec_id: int, codecs: Sequence[int]) -> bool:
 def same_lattice(one: int, other: int) -> bool:
     """Whether two known codecs write the same lattice (or both floats)."""
     return lattice_of(one) is lattice_of(other)
+
+
+@lru_cache(maxsize=256)
+def _codec_like(stored_id: int, codecs: tuple[int, ...]) -> int | None:
+    """The first of the codecs that writes floats or the lattice of the stored one; None: none of them."""
+    for codec_id in codecs:
+        if codec_id in CODECS and (lattice_of(codec_id) is None or same_lattice(codec_id, stored_id)):
+            return codec_id
+    return None
 
 
 def _without_body(head: CatalogEntry | None, held: bytes | None) -> TileAnswer:

@@ -33,6 +33,7 @@ STEPS: Final = (
     (14, "schema_of_owners"),
     (15, "schema_of_standings"),
     (16, "schema_of_bodies"),
+    (17, "schema_of_body_checks"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 _TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks", "copy_notes_", "moved_away_")

@@ -75,6 +75,11 @@ class TileRegion:
         wild = next((i for i, chunk in enumerate(self.chunks) if i and "*" in chunk), len(self.chunks))
         return "/".join(self.chunks[1:wild])
 
+    @property
+    def is_prefix(self) -> bool:
+        """Whether the region holds every tile of its layers below its prefix."""
+        return self.chunks[1 + len(self.prefix.split("/")) if self.prefix else 1 :] == ("**",)
+
     def matches(self, *names: str) -> bool:
         """Whether the region holds a key of these chunks (layer, then the path's)."""
         return _matches(self.chunks, names)

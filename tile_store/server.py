@@ -88,11 +88,12 @@ class TileServer:
             region = TileRegion.of_key(request.key, TILE_ROOT)
         except SchemaError as error:
             raise _refusal(request, error) from None
+        all_below = region.is_prefix
         found = [
             (layer, tile)
             for layer, tile in self._tiles(region)
             if (region.layer is not None or reads_layer(layer, wanted.codecs))
-            and region.matches(layer, *tile.path.split("/"))
+            and (all_below or region.matches(layer, *tile.path.split("/")))
         ]
         if len(found) > MOST_TILES_OF_REGION:
             raise Refused(

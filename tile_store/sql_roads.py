@@ -87,7 +87,7 @@ def publish(c: SqlConnection, road: RoadTile, tile: Tile, over: int, now: int, s
         then.
     """
     place = {"layer": road.layer, "tile": tile.tile_id.morton}
-    head = versions.stored(c, "stored_head", road.layer, tile.tile_id)
+    (head,) = versions.stored_heads(c, road.layer, [tile.tile_id])
     if (head.version if head else 0) != over or fetch(c, "waits_to_be_merged", place):
         return None
     content = Content.of(tile)

@@ -1,5 +1,6 @@
 """Tile versions in SQL: each function runs inside the caller's transaction."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -133,7 +134,7 @@ def put_base(
 
 def _sign_known(c: SqlConnection, layer: str, tile: TileId, sha: bytes, signing: Signing | None) -> None:
     """Sign content that was imported again: the day of its survey may be another one now, or nobody has signed it."""
-    known = stored(c, "stored_head", layer, tile)
+    (known,) = stored_heads(c, layer, [tile])
     if known is None or known.sha != sha:
         raise StoreDamaged(f"tile {tile.path} of layer {layer}: its newest version is not what the head says")
     if signing is not None or known.signature is not None:
@@ -147,10 +148,10 @@ def rollback(c: SqlConnection, layer: str, tile: TileId, version: int, now: int,
         newest = _head(c, layer, tile).version
         raise UnknownVersion(f"tile {tile.path} of layer {layer} has no version {version} (newest: {newest})")
     check_signed(c, signing, old)  # or a body that somebody has put there would get our signature
-    content = Content(old.sha, old.codec_id, old.body)
+    content = Content(old.sha, old.codec_id, old.body, check=old.body_check)
     size = fetch(c, "size_of_version", {"layer": layer, "tile": tile.morton, "version": version})[0][0]
     _append(c, layer, tile, content, _Origin("rollback"), now, signing, size)
-    current = stored(c, "stored_head", layer, tile)
+    (current,) = stored_heads(c, layer, [tile])
     assert current is not None
     return current
 
@@ -163,10 +164,9 @@ def stored(c: SqlConnection, statement: str, layer: str, tile: TileId, **values:
 
 def stored_heads(c: SqlConnection, layer: str, tiles: Sequence[TileId]) -> list[StoredTile | None]:
     """The newest versions of some tiles, in their order; None: there is none."""
-    if not tiles:
-        return []
-    found = c.fetch_each("stored_head_of_many", [{"tile": tile.morton} for tile in tiles], {"layer": layer})
-    return [_version_of(rows[0]) if rows else None for rows in found]
+    rows = fetch(c, "stored_heads", {"layer": layer, "tiles": json.dumps([tile.morton for tile in tiles])})
+    found = {version.tile: version for version in map(_version_of, rows)}
+    return [found.get(tile) for tile in tiles]
 
 
 def _version_of(row: Row) -> StoredTile:
@@ -234,6 +234,7 @@ def _append(
         "size_bytes": len(content.body) if size_bytes is None else size_bytes,
         "provenance": encode_provenance(origin.provenance),
         "body": b"" if lies_elsewhere(c, content) else content.body,
+        "body_check": content.check,
         "epoch": head.epoch if origin.kind == "merged" else version,
     }
     row |= columns(c, signing, row, day_of_version(origin.kind, row["created_ns"], origin.surveyed_ns))

@@ -465,7 +465,7 @@ class SqlStore(ABC):
     def load(self, claim: Claim) -> TileWork:
         """See `Store.load`."""
         with self._readers.snapshot() as c:
-            head = versions.stored(c, "stored_head", claim.layer, claim.tile)
+            (head,) = versions.stored_heads(c, claim.layer, [claim.tile])
             work = TileWork(claim, head, self._in_play(c, claim.layer, claim.tile))
             check_signed(c, self.signing, work.epoch)
         play = replace(work.journal, epoch=self._whole(work.journal.epoch))
@@ -695,7 +695,7 @@ class SqlStore(ABC):
             elif at_ns is not None:
                 found = versions.stored(c, "stored_at", layer, tile, at_ns=at_ns)
             else:
-                found = versions.stored(c, "stored_head", layer, tile)
+                (found,) = versions.stored_heads(c, layer, [tile])
         return self._whole(found)
 
     def get_each(self, layer: str, tiles: Sequence[TileId]) -> list[StoredTile | None]:

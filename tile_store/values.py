@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from hashlib import sha256
 from math import ceil
 from typing import Final, Literal
 
@@ -36,6 +37,7 @@ def counted_out(named: frozenset[str]) -> frozenset[str]:
 
 
 SHA_BYTES: Final = 32
+CHECK_BYTES: Final = 16
 NS_PER_S: Final = 1_000_000_000
 DEFAULT_LAYER: Final = "ndt"
 DEFAULT_CODEC: Final = "standard"
@@ -75,18 +77,27 @@ REFUTED_SHARE: Final = 0.5
 """... if they are so many of all that could be compared."""
 
 
+def check_of_body(sha: bytes, codec_id: int, body: bytes) -> bytes:
+    """What tells, without decoding, that a body is the one that was encoded for a content: 16 bytes of the SHA-256 of the
+    content's hash (32 bytes), the codec (4 bytes, little-endian) and the body.
+    """
+    return sha256(b"".join((sha, codec_id.to_bytes(4, "little"), body))).digest()[:CHECK_BYTES]
+
+
 @dataclass(frozen=True, slots=True)
 class Content:
     """A tile's content as a store keeps it: hash, codec and encoded bytes.
 
     `kept_s` is when, by `time.monotonic`, its body was about to be put among the objects of the store; None: it is not
-    there. An empty body lies there already, named by another version.
+    there. An empty body lies there already, named by another version. `check` is `check_of_body` of the body as it was
+    encoded; None: nobody knows, the content is from an older version of the store.
     """
 
     sha: bytes
     codec_id: int
     body: bytes = field(repr=False)
     kept_s: float | None = None
+    check: bytes | None = None
 
     @classmethod
     def of(cls, tile: AnyTile) -> "Content":
@@ -96,7 +107,7 @@ class Content:
         codec_id, body = encode_content(tile)
         if len(body) > MAX_TILE_BODY_BYTES:
             raise StoreError(f"tile {tile.tile_id.path} has {len(body)} bytes, a message holds {MAX_TILE_BODY_BYTES}")
-        return cls(tile.sha, codec_id, body)
+        return cls(tile.sha, codec_id, body, check=check_of_body(tile.sha, codec_id, body))
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,8 +201,17 @@ class StoredTile:
     body: bytes = field(repr=False)
     surveyed_ns: int | None = None
     """When the world was measured of which a base was built; None: not told, or no base."""
+    body_check: bytes | None = field(default=None, repr=False)
+    """`check_of_body` when the body was encoded; None: the version is older than these."""
     signature: VersionSignature | None = field(default=None, repr=False)
     """Of who answers for it; None: nobody does."""
+
+    @property
+    def is_as_encoded(self) -> bool:
+        """Whether the body is known to be the one that was encoded for this hash: nobody needs to decode it. False: it
+        is not, or not known.
+        """
+        return self.body_check is not None and self.body_check == check_of_body(self.sha, self.codec_id, self.body)
 
     @property
     def statement(self) -> VersionStatement:

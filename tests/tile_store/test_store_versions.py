@@ -155,6 +155,17 @@ def test_history_tells_what_became_of_a_tile(store: Store) -> None:
     assert [v.size_bytes for v in store.history("ndt", TILE)] == [len(b.body) for b in bodies if b]
 
 
+def test_every_version_says_what_its_body_was_when_it_was_encoded(store: Store) -> None:
+    merged_versions(store, 1)
+    store.rollback("ndt", TILE, 1)
+    read = [store.get("ndt", TILE, version=v) for v in (1, 2, 3)]
+    assert [one.is_as_encoded for one in read if one] == [True, True, True]
+    assert read[2] == store.get_each("ndt", [EAST, TILE])[1]
+    assert read[0] is not None
+    for other in ({"body": b"?"}, {"sha": bytes(32)}, {"codec_id": 9}, {"body_check": None}):
+        assert not dataclasses.replace(read[0], **other).is_as_encoded
+
+
 def test_rollback_publishes_the_next_version_with_the_old_body(store: Store) -> None:
     merged_versions(store, 2)
     old = store.get("ndt", TILE, version=1)

@@ -217,6 +217,56 @@ def test_a_damaged_body_is_not_sent_whether_it_was_sent_before_or_not(store: Sql
         assert answers.one(store.get("ndt", TILE), TileRequest()).blob is not None
 
 
+def test_a_body_as_it_was_encoded_is_sent_without_decoding_it(
+    store: SqliteStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tile,) = put(store, street(TILE, 1))
+    monkeypatch.setattr(StoredTile, "decode", lambda _: pytest.fail("decoded"))
+    reply = TileAnswers(store).one(store.get("ndt", TILE), TileRequest())
+    assert reply.blob is not None
+    assert tile_of(reply.blob) == tile
+
+
+def altered(store: SqliteStore, command: str) -> TileAnswers:
+    with apsw.Connection(str(store.path)) as connection:
+        connection.execute(command)
+    return TileAnswers(store)
+
+
+@pytest.mark.parametrize("check", ["NULL", "zeroblob(16)"])
+def test_a_body_without_its_check_is_decoded_and_sent_if_it_is_whole(store: SqliteStore, check: str) -> None:
+    """Of a version from before there were checks; and where the check itself was damaged."""
+    (tile,) = put(store, street(TILE, 1))
+    answers = altered(store, f"UPDATE tile_version SET body_check = {check}")
+    reply = answers.one(store.get("ndt", TILE), TileRequest())
+    assert reply.blob is not None
+    assert tile_of(reply.blob) == tile
+    damage(store, 1)
+    with pytest.raises(StoreDamaged, match="version 1: damaged"):
+        TileAnswers(store).one(store.get("ndt", TILE), TileRequest())
+
+
+def test_a_body_of_another_content_is_not_sent_not_even_with_its_check(store: SqliteStore) -> None:
+    put(store, street(TILE, 1))
+    put(store, street(TILE, 2))
+    answers = altered(
+        store,
+        "UPDATE tile_version SET (body, body_check) = (SELECT body, body_check FROM tile_version WHERE version = 1)"
+        " WHERE version = 2",
+    )
+    with pytest.raises(StoreDamaged, match="version 2: damaged"):
+        answers.one(store.get("ndt", TILE), TileRequest())
+
+
+def test_a_damaged_body_that_is_published_again_stays_damaged(store: SqliteStore) -> None:
+    put(store, street(TILE, 1))
+    put(store, street(TILE, 2))
+    damage(store, 1)
+    assert store.rollback("ndt", TILE, 1).version == 3
+    with pytest.raises(StoreDamaged, match="version 3: damaged"):
+        TileAnswers(store).one(store.get("ndt", TILE), TileRequest())
+
+
 # Several tiles
 
 

@@ -490,6 +490,10 @@ CREATE TABLE body_going (
 );
 CREATE INDEX tile_version_elsewhere ON tile_version (sha, codec_id) WHERE length(body) = 0;
 
+-- name: schema_of_body_checks
+-- Step 17, likewise.
+ALTER TABLE tile_version ADD COLUMN body_check bytea CHECK (body_check IS NULL OR length(body_check) = 16);
+
 -- name: store_lock
 SELECT store_lock(:store::integer, :alone <> 0, :parts::bigint[]::integer[])
 
@@ -548,14 +552,6 @@ FROM unnest(:layer::text[], :tile::bigint[], :report_id::text[], :part::bigint[]
     SELECT MAX(r.seq), MAX(r.vehicle) FILTER (WHERE r.report_id = w.report_id AND r.part = w.part) FROM report AS r
     WHERE r.layer = w.layer AND r.tile = w.tile
   ) AS s (seq, vehicle)
-
--- name: stored_head_of_many_each
-SELECT w.n, v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id,
-       v.body, s.surveyed_ns, v.signer, v.signed_s, v.signature
-FROM unnest(:tile::bigint[]) WITH ORDINALITY AS w (tile, n)
-  JOIN tile_head AS h ON h.layer = :layer AND h.tile = w.tile
-  JOIN tile_version AS v ON v.layer = h.layer AND v.tile = h.tile AND v.version = h.version
-  LEFT JOIN survey AS s ON s.layer = v.layer AND s.tile = v.tile AND s.version = v.version
 
 -- name: confirmed_version_each
 SELECT w.n, h.version
@@ -648,6 +644,14 @@ WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
   AND NOT EXISTS (SELECT 1 FROM trial AS t WHERE t.state IN ('trial', 'paused')
     AND t.layer = dirty.layer AND t.tile = dirty.tile)
 ORDER BY ready_ns, layer, tile LIMIT :n FOR UPDATE OF dirty SKIP LOCKED
+
+-- name: stored_heads
+SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body,
+       s.surveyed_ns, v.body_check, v.signer, v.signed_s, v.signature
+FROM json_array_elements_text(:tiles::json) AS w (tile)
+  JOIN tile_head AS h ON h.layer = :layer AND h.tile = w.tile::bigint
+  JOIN tile_version AS v ON v.layer = h.layer AND v.tile = h.tile AND v.version = h.version
+  LEFT JOIN survey AS s ON s.layer = v.layer AND s.tile = v.tile AND s.version = v.version
 
 -- name: unknown_reports
 SELECT value FROM json_array_elements_text(:ids::json) AS wanted (value)

@@ -677,9 +677,9 @@ SELECT created_ns FROM tile_version WHERE layer = :layer AND tile = :tile ORDER 
 
 -- name: insert_version
 INSERT INTO tile_version (layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, size_bytes,
-                          provenance, body, signer, signed_s, signature)
+                          provenance, body, body_check, signer, signed_s, signature)
 VALUES (:layer, :tile, :version, :parent, :kind, :created_ns, :merger, :n_reports, :sha, :codec_id, :size_bytes,
-        :provenance, :body, :signer, :signed_s, :signature)
+        :provenance, :body, :body_check, :signer, :signed_s, :signature)
 
 -- name: insert_head
 INSERT INTO tile_head (layer, tile, version, epoch, sha) VALUES (:layer, :tile, :version, :epoch, :sha)
@@ -699,34 +699,27 @@ DELETE FROM notice WHERE layer = :layer AND tile = :tile AND version = :version
 SELECT layer, tile, version FROM notice WHERE created_ns <= :before ORDER BY created_ns, layer, tile, version LIMIT :n
 
 -- name: stored_version
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, signer,
-       signed_s, signature
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, body_check,
+       signer, signed_s, signature
 FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND version = :version
 
--- name: stored_head
+-- name: stored_heads
 SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body,
-       s.surveyed_ns, v.signer, v.signed_s, v.signature
-FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
+       s.surveyed_ns, v.body_check, v.signer, v.signed_s, v.signature
+FROM json_each(:tiles) AS w CROSS JOIN tile_head AS h ON h.layer = :layer AND h.tile = w.value
+  JOIN tile_version AS v USING (layer, tile, version)
   LEFT JOIN survey AS s USING (layer, tile, version)
-WHERE h.layer = :layer AND h.tile = :tile
-
--- name: stored_head_of_many
-SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body,
-       s.surveyed_ns, v.signer, v.signed_s, v.signature
-FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
-  LEFT JOIN survey AS s USING (layer, tile, version)
-WHERE h.layer = :layer AND h.tile = :tile
 
 -- name: stored_at
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, signer,
-       signed_s, signature
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, body_check,
+       signer, signed_s, signature
 FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND created_ns <= :at_ns ORDER BY version DESC LIMIT 1
 
 -- name: stored_by_sha
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, signer,
-       signed_s, signature
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, body_check,
+       signer, signed_s, signature
 FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND sha = :sha ORDER BY version DESC LIMIT 1
 
@@ -1705,6 +1698,11 @@ CREATE TABLE body_going (
   PRIMARY KEY (sha, codec_id)
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX tile_version_elsewhere ON tile_version (sha, codec_id) WHERE length(body) = 0;
+
+-- name: schema_of_body_checks
+-- Step of the schema. `gnd.tile_store.values.check_of_body` of what was encoded when the version was made, wherever the
+-- body lies by now; NULL: the version is older than this column.
+ALTER TABLE tile_version ADD COLUMN body_check BLOB CHECK (body_check IS NULL OR length(body_check) = 16);
 
 -- name: place_of_bodies
 SELECT location FROM body_place
