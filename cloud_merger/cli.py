@@ -19,6 +19,8 @@ from gnd.fleet_bus.settings_options import settings_options
 from gnd.gnd_map.settings import settings_text
 from gnd.tile_store.location import shown
 from gnd.tile_store.moving import run_following
+from gnd.tile_store.options import wait_option
+from gnd.tile_store.waiting import wait_for_store
 
 
 @click.command()
@@ -28,6 +30,7 @@ from gnd.tile_store.moving import run_following
 )
 @click.option("--connect", multiple=True, help="Endpoint of a router, tcp/host:port; may be repeated.")
 @click.option("--follow", is_flag=True, help="When the store moves (`gnd store copy`), go on with the new one.")
+@wait_option
 @click.option("--mode", type=click.Choice(get_args(Mode)), help="How votes are counted.  [default: default]")
 @settings_options
 @metrics_options
@@ -37,6 +40,7 @@ def merger(
     store_path: str | None,
     connect: tuple[str, ...],
     follow: bool,
+    wait_s: float,
     mode: str | None,
     config_file: Path | None,
     changes: tuple[str, ...],
@@ -61,9 +65,10 @@ def merger(
         signal.signal(number, lambda *_: stop.set())
     click.echo(f"merger {config.shard_id}: store {shown(config.store_path)}, mode {config.merge.mode}", err=True)
     metrics_at = None if metrics_port is None else (metrics_host, metrics_port)
-    if not follow:
+    wait_for_store(config.store_path, wait_s, stop)
+    if follow:
+        run_following(
+            config.store_path, lambda at, ended: run_shard(replace(config, store_path=at), ended, metrics_at), stop
+        )
+    elif not stop.is_set():
         run_shard(config, stop, metrics_at)
-        return
-    run_following(
-        config.store_path, lambda at, ended: run_shard(replace(config, store_path=at), ended, metrics_at), stop
-    )

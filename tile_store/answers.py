@@ -190,8 +190,8 @@ class TileAnswers:
     def _check(self, stored: StoredTile) -> None:
         """StoreDamaged where the body is not what its hash says: no client could use it, and all would ask again.
 
-        It was encoded from that content, if its check tells so. Any other, also one that is older than checks, is decoded
-        once; from then on its checksum tells whether the same bytes were read.
+        It was encoded from that content, if its check tells so. Any other, also one that is older than checks, is
+        decoded once; from then on its checksum tells whether the same bytes were read.
         """
         if stored.is_as_encoded:
             return

@@ -34,12 +34,13 @@ from gnd.tile_store.errors import StoreError
 from gnd.tile_store.location import LOCATION, StoreLocation, file_of, open_store, shown
 from gnd.tile_store.metrics import StoreCollector, store_checks
 from gnd.tile_store.moving import run_following
-from gnd.tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
+from gnd.tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read, wait_option
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.status import status
 from gnd.tile_store.survey_cli import survey
+from gnd.tile_store.waiting import wait_for_store
 
 __all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", "show", "store", "store_to_fill"]
 
@@ -67,6 +68,7 @@ class TileServerConfig:
 @click.option("--path", type=LOCATION, help="The store, a file or a PostgreSQL URL; `gnd map build` makes one.")
 @click.option("--connect", multiple=True, help=f"Endpoint of a router; repeatable.  [default: {DEFAULT_ENDPOINT}]")
 @click.option("--follow", is_flag=True, help="When the store moves (`gnd store copy`), go on with the new one.")
+@wait_option
 @click.option("--workers", type=int, help="Threads that answer, 1 to 64.  [default: 4]")
 @settings_options
 @metrics_options
@@ -77,6 +79,7 @@ def store(
     path: StoreLocation | None,
     connect: tuple[str, ...],
     follow: bool,
+    wait_s: float,
     workers: int | None,
     config_file: Path | None,
     changes: tuple[str, ...],
@@ -104,9 +107,10 @@ def store(
     def serve(location: StoreLocation, ended: threading.Event) -> None:
         _serve(replace(server, path=location), metrics_at, ended)
 
+    wait_for_store(server.path, wait_s, stop)
     if follow:
         run_following(server.path, serve, stop)
-    else:
+    elif not stop.is_set():
         serve(server.path, stop)
     click.echo("tile server ended")
 

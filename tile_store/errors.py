@@ -4,6 +4,7 @@ GndError
 StoreError             a store cannot do what was asked
 StoreUnavailable     it cannot be opened: no such file, no permission, not a store, a newer schema
 StoreDamaged       a part of it cannot be read
+StoreAway          the server of its database does not answer, or starts or stops
 StoreBusy            another process has held the write lock for too long
 StoreMoved         it was copied to another database, which is used instead
 StoreClosed          it was used after close()
@@ -26,6 +27,10 @@ class StoreUnavailable(StoreError):
 
 class StoreDamaged(StoreUnavailable):
     """A page of the store cannot be read; what does not lie on it can."""
+
+
+class StoreAway(StoreUnavailable):
+    """The server of the store's database does not answer, or starts or stops: it may come."""
 
 
 class StoreMoved(StoreUnavailable):

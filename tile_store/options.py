@@ -15,6 +15,7 @@ from gnd.tile_store.location import StoreLocation, file_of, open_store
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER
+from gnd.tile_store.waiting import WAIT_S
 
 PATH: Final = click.Path(path_type=Path)
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -34,6 +35,14 @@ def region_option(command: _F) -> _F:
 def json_option(command: _F) -> _F:
     """Adds --json."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")(command)
+
+
+def wait_option(command: _F) -> _F:
+    """Adds --wait."""
+    help_text = "At the start wait so long for the server of the store's database, s."
+    return click.option(
+        "--wait", "wait_s", default=WAIT_S, show_default=True, type=click.FloatRange(0), help=help_text
+    )(command)
 
 
 def existing(location: StoreLocation) -> SqlStore:

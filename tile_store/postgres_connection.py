@@ -16,6 +16,7 @@ from psycopg.pq.abc import PGresult
 
 from gnd.tile_store.connection import NOTHING, Bindings, Row
 from gnd.tile_store.errors import (
+    StoreAway,
     StoreBusy,
     StoreClosed,
     StoreDamaged,
@@ -63,7 +64,7 @@ _SAYS: Final = (
 _NOT_YET: Final = ("starting up", "shutting down", "in recovery mode", "not yet accepting connections")
 
 
-class ServerNotReady(StoreUnavailable):
+class ServerNotReady(StoreAway):
     """The server is there, and starts or stops."""
 
 
@@ -286,9 +287,9 @@ def _not_let_in(error: psycopg.Error, conninfo: str) -> StoreUnavailable:
     if any(part in line for part in _NOT_YET):
         return ServerNotReady(f"{shown(conninfo)}: the server starts or stops; try again ({line})")
     known = next((meaning for part, meaning in _SAYS if part in line), None)
-    if known is None:
-        known = "cannot be opened" if "FATAL" in line else "no server answers there"
-    return StoreUnavailable(f"{shown(conninfo)}: {known} ({line})")
+    if known is None and "FATAL" not in line:
+        return StoreAway(f"{shown(conninfo)}: no server answers there ({line})")
+    return StoreUnavailable(f"{shown(conninfo)}: {known or 'cannot be opened'} ({line})")
 
 
 def as_store_error(error: Exception, location: str) -> Exception:

@@ -78,8 +78,8 @@ REFUTED_SHARE: Final = 0.5
 
 
 def check_of_body(sha: bytes, codec_id: int, body: bytes) -> bytes:
-    """What tells, without decoding, that a body is the one that was encoded for a content: 16 bytes of the SHA-256 of the
-    content's hash (32 bytes), the codec (4 bytes, little-endian) and the body.
+    """What tells, without decoding, that a body is the one that was encoded for a content: 16 bytes of the SHA-256 of
+    the content's hash (32 bytes), the codec (4 bytes, little-endian) and the body.
     """
     return sha256(b"".join((sha, codec_id.to_bytes(4, "little"), body))).digest()[:CHECK_BYTES]
 

@@ -12,8 +12,7 @@ import os
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,11 +35,10 @@ from gnd.tile_store.location import StoreLocation, open_store
 from studies.frame.errors import OptionError
 from studies.ingest import costs
 from studies.scale.loads import LoadSetting, MeasuredLoad
+from studies.scale.room import Room, room
 from studies.short_corpus import corpus
 from studies.speed.__main__ import machine
 
-WEIGHT: Final = 64 * 1024
-GROUPS: Final = Path("/sys/fs/cgroup/cpu")
 SETTINGS: Final = (
     # Three to fit the costs on; on one hardly anything is done ...
     LoadSetting("fit", vehicles=1, changed_share=1.0, kmh=15.0, km=0.2),
@@ -78,14 +76,14 @@ def main(
     runs = kept_runs(drives, settled, console)
     told: dict[str, Any] = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {"loads": []}
     told |= {"machine": machine(), "streets": _streets(Streets.of(runs, LoadOptions(changed_share=0.5)))}
-    with one_core() as core:
+    with room() as made:
         if worker:
             told["worker"] = worker_costs()
             out.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
         for number in numbers:
             for location in [None] * files + [store] * bool(store):
-                one = _measured(SETTINGS[number], location, runs)
-                told["loads"].append(asdict(one) | {"core": core, "load_average": os.getloadavg()[0]})
+                one = measured(SETTINGS[number], location, runs, made)
+                told["loads"].append(asdict(one) | {"core": max(made.cores), "load_average": os.getloadavg()[0]})
                 out.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
                 console.print(one)
 
@@ -99,52 +97,37 @@ def worker_costs() -> dict[str, float]:
     return {"flags_ms_a_tile": round(flags / tiles, 2), "half_ms": round(half, 2), "tiles_a_report": round(tiles, 1)}
 
 
-def _silent(_what: str, _done: float, _total: float) -> None:
-    """Nobody looks."""
+def measured(
+    setting: LoadSetting, store: StoreLocation | None, runs: KeptRuns, made: Room, shard_share: float | None = None
+) -> MeasuredLoad:
+    """Run a load in a room.
 
-
-@contextmanager
-def one_core() -> Iterator[int]:
-    """This process and what it starts run on the last core, before all others; gives its number.
+    Args:
+        setting: what is sent.
+        store: a database, which is emptied before; None: a file for the time being.
+        runs: the kept drives.
+        made: the room.
+        shard_share: each shard with its worker uses at most so much of one core; None: what it can get.
 
     Raises:
-        OptionError: control groups (version 1) cannot be made here.
+        OptionError: not all was merged in time.
     """
-    group = GROUPS / f"gnd-scale-{os.getpid()}"
-    core, before = max(os.sched_getaffinity(0)), os.sched_getaffinity(0)
-    try:
-        group.mkdir()
-    except OSError as error:
-        raise OptionError(f"no control group can be made: {error}; it takes root and {GROUPS}") from error
-    try:
-        (group / "cpu.shares").write_text(str(WEIGHT), encoding="ascii")
-        enter(os.getpid(), group, core)
-        yield core
-    finally:
-        for pid in (group / "cgroup.procs").read_text(encoding="ascii").split():
-            (GROUPS / "cgroup.procs").write_text(pid, encoding="ascii")
-        os.sched_setaffinity(0, before)
-        group.rmdir()
-
-
-def enter(pid: int, group: Path, core: int) -> None:
-    """A process and its threads enter a group and a core; what it starts afterwards follows."""
-    (group / "cgroup.procs").write_text(str(pid), encoding="ascii")
-    for thread in psutil.Process(pid).threads():
-        os.sched_setaffinity(thread.id, {core})
-
-
-def _measured(setting: LoadSetting, store: StoreLocation | None, runs: KeptRuns) -> MeasuredLoad:
-    options = setting.options(DRAIN_S)
     if store is not None:
         _emptied(str(store))
-        group, core = GROUPS / f"gnd-scale-{os.getpid()}", max(os.sched_getaffinity(0))
         server = psutil.Process(server_of(store))
         for process in (server, *server.children()):
-            with suppress(ProcessLookupError, psutil.NoSuchProcess):  # a connection that has ended
-                enter(process.pid, group, core)
+            made.enter(process.pid)
     with tempfile.TemporaryDirectory() as folder:
-        outcome = run_load(options, runs, Path(folder), _silent, threading.Event(), store)
+        pids = Path(folder) / "pids.json"
+
+        def tell(_what: str, _done: float, _total: float) -> None:
+            if shard_share is not None and pids.exists():
+                told: dict[str, int] = json.loads(pids.read_text(encoding="utf-8"))
+                for name in [name for name in told if name.startswith("merger-")]:
+                    made.bound(name, shard_share, told[name])
+
+        outcome = run_load(setting.options(DRAIN_S), runs, Path(folder), tell, threading.Event(), store)
+        made.unbound()
         with open_store(Path(folder) / "store.sqlite" if store is None else store, create=False) as opened:
             parts = Counter(row.part for row in opened.reports())
     return measured_load(setting, "file" if store is None else "postgresql", outcome, parts)

@@ -55,7 +55,9 @@ def test_matching_agrees_with_a_regular_expression(chunks: list[str], bits: int)
 @given(tiles, st.lists(st.sampled_from(["keep", "*", "**"]), min_size=1, max_size=5))
 def test_a_region_that_is_a_prefix_holds_every_tile_below_it(tile: TileId, choices: list[str]) -> None:
     names = ["ndt", *tile.path.split("/")]
-    region = TileRegion(tuple(name if choice == "keep" else choice for name, choice in zip(names, choices, strict=False)))
+    region = TileRegion(
+        tuple(name if choice == "keep" else choice for name, choice in zip(names, choices, strict=False))
+    )
     assert not region.is_prefix or region.matches(*names)
     is_plain = set(choices[1:-1]) <= {"keep"} and len(choices) > 1 and choices[-1] == "**" and choices[0] != "**"
     assert region.is_prefix or not is_plain

@@ -1,0 +1,127 @@
+"""Reports a second over their whole way, with a store in a file and in PostgreSQL in turns, or with 1, 2 and 4 shards.
+
+    python -m studies.scale.rates --store postgresql://…/empty_database --rounds 3 (as root)
+    python -m studies.scale.rates --shards 1,2,4 --share 0.2 --rounds 3 (as root)
+
+A load (`gnd load`) offers more than the cloud can do; counted are its reports from the first one sent until nothing
+waits any more: acknowledged, journaled, merged, published and told. All processes, the database server too, share the
+last cores of the machine, on which they go before everybody else (control groups). With `--share` each shard with its
+worker gets so much of a core and no more, so that the shards are the limit, whatever else the machine does. DATABASE is
+emptied before each run.
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import click
+from rich.console import Console
+
+from gnd.deploy.load.drives import KeptRuns
+from gnd.deploy.load.making import kept_runs
+from studies.scale.loads import LoadSetting, MeasuredLoad
+from studies.scale.measure import measured
+from studies.scale.room import Room, room
+
+
+@click.command(help=__doc__)
+@click.option("--store", default="", help="A PostgreSQL database of its own; none: a file.")
+@click.option("--shards", default="", help="Numbers of shards with commas between, all with the same store.")
+@click.option("--share", default=0.2, show_default=True, type=click.FloatRange(0.01, 1.0), help="Of a core, a shard.")
+@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1))
+@click.option("--cores", default=1, show_default=True, type=click.IntRange(1), help="That all share.")
+@click.option("--vehicles", default=60, show_default=True, type=click.IntRange(1))
+@click.option("--km", default=0.4, show_default=True, type=click.FloatRange(0.1), help="Way of each vehicle.")
+@click.option("--drives", type=click.Path(path_type=Path), help="As `gnd load` has it.")
+@click.option("--settled", type=click.Path(path_type=Path), help="As `gnd load` has it.")
+def main(
+    store: str,
+    shards: str,
+    share: float,
+    rounds: int,
+    cores: int,
+    vehicles: int,
+    km: float,
+    drives: Path | None,
+    settled: Path | None,
+) -> None:
+    """Measure in turns, and print a line a run and one for all."""
+    runs = kept_runs(drives, settled, Console(stderr=True))
+    with room(cores) as made:
+        if shards:
+            counts = [int(one) for one in shards.split(",")]
+            _of_shards(_load(vehicles, km), counts, share, rounds, store, runs, made)
+        else:
+            _of_stores(_load(vehicles, km), rounds, store, runs, made)
+
+
+def _load(vehicles: int, km: float) -> LoadSetting:
+    return LoadSetting("compared", vehicles=vehicles, changed_share=0.5, km=km)
+
+
+def _of_stores(setting: LoadSetting, rounds: int, store: str, runs: KeptRuns, made: Room) -> None:
+    if not store:
+        raise click.UsageError("say a database (--store), or numbers of shards (--shards)")
+    pairs = list[tuple[MeasuredLoad, MeasuredLoad]]()
+    for number in range(rounds):
+        found = {
+            place: _told(measured(setting, place or None, runs, made))
+            for place in ("", store)[:: 1 if number % 2 else -1]
+        }
+        pairs.append((found[""], found[store]))
+    _say(
+        "PostgreSQL over a file, worst, median, best",
+        reports_per_s=_ends([there.reports_per_s / file.reports_per_s for file, there in pairs]),
+        by_cpu=_ends([_cpu_ms(file) / _cpu_ms(there) for file, there in pairs]),
+    )
+
+
+def _of_shards(
+    setting: LoadSetting, counts: Sequence[int], share: float, rounds: int, store: str, runs: KeptRuns, made: Room
+) -> None:
+    rates: dict[int, list[float]] = {count: [] for count in counts}
+    for number in range(rounds):
+        for count in counts[:: -1 if number % 2 else 1]:
+            one = LoadSetting("compared", setting.vehicles, setting.changed_share, count, setting.kmh, setting.km)
+            rates[count].append(_told(measured(one, store or None, runs, made, share)).reports_per_s)
+    for count in counts[1:]:
+        pairs = zip(rates[counts[0]], rates[count], strict=True)
+        _say(
+            f"{count} shards over {counts[0]}, worst, median, best",
+            reports_per_s=_ends([many / one for one, many in pairs]),
+        )
+
+
+def _told(one: MeasuredLoad) -> MeasuredLoad:
+    _say(
+        f"{one.store}, {one.setting.shards} shards",
+        reports=one.reports,
+        reports_per_s=round(one.reports_per_s, 2),
+        offered_per_s=round(one.reports / one.offered_s, 2),
+        versions=one.versions,
+        cpu_ms=round(_cpu_ms(one), 1),
+        by_part={name: round(1e3 * used_s / one.reports, 1) for name, used_s in one.cpu_s.items()},
+        lag_p50_s=one.lag_s["p50"],
+        load=round(os.getloadavg()[0], 1),
+    )
+    return one
+
+
+def _cpu_ms(one: MeasuredLoad) -> float:
+    """Of the cloud and its database a report."""
+    return 1e3 * one.cloud_cpu_s / one.reports
+
+
+def _ends(ratios: Sequence[float]) -> list[float]:
+    return [round(one, 2) for one in (min(ratios), median(ratios), max(ratios))]
+
+
+def _say(what: str, **told: Any) -> None:
+    click.echo(json.dumps({"what": what} | told))
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m studies.scale.rates")
