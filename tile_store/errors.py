@@ -14,7 +14,12 @@ UnknownReports       a publication names reports that the store does not hold
 IdTaken              a report has the id of another vehicle's
 """
 
+from typing import Final
+
 from gnd.gnd_map.errors import GndError
+
+NO_ROW: Final = (TypeError, ValueError, KeyError, IndexError, ArithmeticError, AttributeError)
+"""What rows with values that nobody has written lead to."""
 
 
 class StoreError(GndError):

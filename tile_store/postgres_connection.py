@@ -18,13 +18,12 @@ from gnd.tile_store.connection import NOTHING, Bindings, Row
 from gnd.tile_store.errors import (
     StoreAway,
     StoreBusy,
-    StoreClosed,
     StoreDamaged,
     StoreError,
     StoreMoved,
     StoreUnavailable,
-    odd_row,
 )
+from gnd.tile_store.idle import IdleConnections
 from gnd.tile_store.postgres_wire import BoundStatement, PostgresWire, columns_of
 from gnd.tile_store.sql import statements
 
@@ -40,7 +39,6 @@ CLOCK_READ_EVERY_S: Final = 10.0
 MOVED_STATE: Final = "GND01"
 """The code of PostgreSQL's error for a store that has moved."""
 CLOCK_NAME: Final = "database"
-_NO_ROW: Final = (TypeError, ValueError, KeyError, IndexError, ArithmeticError, AttributeError)
 _SETTINGS: Final = (
     "SET client_min_messages = warning; SET jit = off; SET lock_timeout = '30s'; SET DateStyle = ISO; "
     "SET plan_cache_mode = force_generic_plan; "
@@ -343,10 +341,10 @@ class PostgresReaders:
     def __init__(self, conninfo: str, clock: DatabaseClock) -> None:
         self._conninfo, self._clock = conninfo, clock
         self._location = shown(conninfo)
-        self._idle: list[PostgresConnection] = []
+        self._idle = IdleConnections[PostgresConnection](
+            self._location, psycopg.Error, lambda error: as_store_error(error, self._location)
+        )
         self._free = threading.Semaphore(MOST_READERS)
-        self._lock = threading.Lock()
-        self._closed = False
 
     @contextmanager
     def snapshot(self) -> Iterator[PostgresConnection]:
@@ -362,49 +360,20 @@ class PostgresReaders:
         if not self._free.acquire(timeout=READER_PATIENCE_S):
             raise StoreBusy(f"{self._location}: {MOST_READERS} readers of this process for {READER_PATIENCE_S:.0f} s")
         try:
-            with self._checked(self._ready()) as connection:
+            with self._idle.lent(self._ready()) as connection:
+                connection.clock.read_with(connection.raw)
                 yield connection
         finally:
             self._free.release()
 
     def close(self) -> None:
         """Close the idle connections; those in use close when they come back."""
-        with self._lock:
-            self._closed = True
-            idle, self._idle = self._idle, []
-        for connection in idle:
-            connection.close()
-
-    @contextmanager
-    def _checked(self, connection: PostgresConnection) -> Iterator[PostgresConnection]:
-        try:
-            connection.clock.read_with(connection.raw)
-            yield connection
-        except psycopg.Error as error:
-            connection.close()
-            raise as_store_error(error, self._location) from None
-        except _NO_ROW as error:
-            connection.close()
-            raise odd_row(self._location, error) from error
-        except BaseException:
-            connection.close()
-            raise
-        with self._lock:
-            if not self._closed:
-                self._idle.append(connection)
-                return
-        connection.close()
+        self._idle.close()
 
     def _ready(self) -> PostgresConnection:
         """A connection outside any transaction; one that the server has closed meanwhile is not used."""
-        while (connection := self._taken()) is not None and connection.is_lost:
+        while (connection := self._idle.take()) is not None and connection.is_lost:
             connection.close()
         if connection is None:
             connection = patiently(lambda: connect(self._conninfo, self._clock))
         return connection
-
-    def _taken(self) -> PostgresConnection | None:
-        with self._lock:
-            if self._closed:
-                raise StoreClosed(f"{self._location}: the store is closed")
-            return self._idle.pop() if self._idle else None

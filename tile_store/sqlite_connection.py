@@ -2,7 +2,6 @@
 
 import os
 import random
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -14,15 +13,8 @@ import apsw
 
 from gnd.tile_store import clocks
 from gnd.tile_store.connection import NOTHING, Bindings, Row
-from gnd.tile_store.errors import (
-    StoreBusy,
-    StoreClosed,
-    StoreDamaged,
-    StoreError,
-    StoreMoved,
-    StoreUnavailable,
-    odd_row,
-)
+from gnd.tile_store.errors import StoreBusy, StoreDamaged, StoreError, StoreMoved, StoreUnavailable
+from gnd.tile_store.idle import IdleConnections
 from gnd.tile_store.migrations import SCHEMA_VERSION, migrate, schema_of
 from gnd.tile_store.sql import statements
 
@@ -31,10 +23,6 @@ SQL: Final = statements("sqlite")
 READER_PATIENCE_S: Final = 30.0
 OLDEST_SQLITE: Final = (3, 51, 3)
 """Older ones can corrupt a WAL that several connections write and checkpoint."""
-
-
-NO_ROW: Final = (TypeError, ValueError, KeyError, IndexError, ArithmeticError, AttributeError)
-"""What rows with values that nobody has written lead to."""
 
 
 T = TypeVar("T")
@@ -227,9 +215,7 @@ class ReaderPool:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._idle: list[SqliteConnection] = []
-        self._lock = threading.Lock()
-        self._closed = False
+        self._idle = IdleConnections[SqliteConnection](str(path), apsw.Error, lambda error: as_store_error(error, path))
 
     @contextmanager
     def snapshot(self) -> Iterator[SqliteConnection]:
@@ -246,39 +232,10 @@ class ReaderPool:
     @contextmanager
     def connection(self) -> Iterator[SqliteConnection]:
         """A connection outside any transaction; it is not used again after an error."""
-        connection = self._take()
-        try:
+        idle = self._idle.take()
+        with self._idle.lent(open_reader(self._path) if idle is None else idle) as connection:
             yield connection
-        except apsw.Error as error:
-            connection.close()
-            raise as_store_error(error, self._path) from None
-        except NO_ROW as error:
-            connection.close()
-            raise odd_row(str(self._path), error) from error
-        except BaseException:
-            connection.close()
-            raise
-        self._give_back(connection)
 
     def close(self) -> None:
         """Close the idle connections; those in use close when they come back."""
-        with self._lock:
-            self._closed = True
-            idle, self._idle = self._idle, []
-        for connection in idle:
-            connection.close()
-
-    def _take(self) -> SqliteConnection:
-        with self._lock:
-            if self._closed:
-                raise StoreClosed(f"{self._path}: the store is closed")
-            if self._idle:
-                return self._idle.pop()
-        return open_reader(self._path)
-
-    def _give_back(self, connection: SqliteConnection) -> None:
-        with self._lock:
-            if not self._closed:
-                self._idle.append(connection)
-                return
-        connection.close()
+        self._idle.close()
