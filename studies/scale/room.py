@@ -1,14 +1,19 @@
 """Room on a shared machine: cores that processes have before everybody else, and bounds for some of them (control
 groups, version 1, as root).
+
+    python -m studies.scale.room [--with PID] -- COMMAND …
 """
 
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import click
 import psutil
 
 from studies.frame.errors import OptionError
@@ -88,3 +93,20 @@ def _emptied(group: Path, into: Path) -> None:
         with suppress(ProcessLookupError):
             (into / "cgroup.procs").write_text(pid, encoding="ascii")
     group.rmdir()
+
+
+@click.command(help="Run a command on the last core before everybody else, as root: its clock means something then.")
+@click.option("--with", "pids", multiple=True, type=int, help="A process that comes along, with those it has started.")
+@click.argument("command", nargs=-1, required=True)
+def main(pids: tuple[int, ...], command: tuple[str, ...]) -> None:
+    """Run it, and end as it does."""
+    with room() as made:
+        for pid in pids:
+            made.enter(pid)
+            for child in psutil.Process(pid).children(recursive=True):
+                made.enter(child.pid)
+        sys.exit(subprocess.run(command, check=False).returncode)  # noqa: S603  what the user has typed
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m studies.scale.room")
