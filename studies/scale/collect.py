@@ -1,10 +1,14 @@
 """Refresh `costs.json` from what the commands have printed: each number beside its command, machine and date.
 
 gnd reproduce steady-vehicle --length 1000 --parking 0.05 --out runs/steady --json steady.json
-python -m studies many-tiles --store many.sqlite --tiles 1000000 --json > many.json
-python -m studies many-tiles --store postgresql://…/empty_database --tiles 1000000 --json > many_database.json
-python -m studies.stores_study postgresql://…/empty_database --server PID > stores.jsonl
-python -m studies.scale.collect runs/steady steady.json many.json many_database.json stores.jsonl
+python -m studies.scale.room -- python -m studies many-tiles --tiles 1000000 --store many.sqlite --json > many.json
+python -m studies.scale.room --with PID -- python -m studies many-tiles --tiles 1000000 --store URL --json > there.json
+python -m studies.scale.room --with PID -- python -m studies.stores_study URL --server PID > stores.jsonl
+python -m studies.scale.collect --steady runs/steady steady.json --many many.json --many-database there.json
+python -m studies.scale.collect --stores stores.jsonl
+
+URL: of a PostgreSQL database of its own, PID: the first process of its server. What is not given stays as it is. A
+store with many tiles is filled first, by the same command without a room: that takes minutes.
 """
 
 import json
@@ -19,29 +23,33 @@ from studies.scale.plan import MeasuredFigure
 from studies.speed.__main__ import machine
 
 STEADY: Final = "gnd reproduce steady-vehicle --length 1000 --parking 0.05"
-MANY: Final = "python -m studies many-tiles --tiles 1000000 --store "
-PLACES: Final = {"file": "many.sqlite", "postgresql": "postgresql://…/empty_database"}
-STORES: Final = "python -m studies.stores_study postgresql://…/empty_database --server PID --rounds 3"
+MANY: Final = "python -m studies.scale.room{} -- python -m studies many-tiles --tiles 1000000 --store {}"
+PLACES: Final = {"file": ("", "many.sqlite"), "postgresql": (" --with PID", "postgresql://…/database")}
+STORES: Final = "python -m studies.scale.room --with PID -- python -m studies.stores_study postgresql://… --server PID"
 OUT: Final = Path(__file__).parent / "costs.json"
 FILE: Final = click.Path(path_type=Path, exists=True)
 
 
 @click.command(help=__doc__)
-@click.argument("steady_run", type=FILE)
-@click.argument("steady", type=FILE)
-@click.argument("many", type=FILE)
-@click.argument("many_database", type=FILE)
-@click.argument("stores", type=FILE)
-def main(steady_run: Path, steady: Path, many: Path, many_database: Path, stores: Path) -> None:
+@click.option("--steady", nargs=2, type=FILE, help="The run, and what it printed.")
+@click.option("--many", type=FILE, help="Of a file.")
+@click.option("--many-database", type=FILE, help="Of PostgreSQL.")
+@click.option("--stores", type=FILE)
+def main(steady: tuple[Path, Path] | None, many: Path | None, many_database: Path | None, stores: Path | None) -> None:
     """Write the file beside this module."""
-    found = of_steady(json.loads(steady.read_text(encoding="utf-8")), steady_run / "run" / "store.sqlite")
+    found = dict[str, dict[str, Any]]()
+    if steady is not None:
+        run, printed = steady
+        found |= of_steady(json.loads(printed.read_text(encoding="utf-8")), run / "run" / "store.sqlite")
     for kind, path in (("file", many), ("postgresql", many_database)):
-        found |= of_many(json.loads(path.read_text(encoding="utf-8")), kind)
-    found |= of_stores([json.loads(line) for line in stores.read_text(encoding="utf-8").splitlines()])
+        if path is not None:
+            found |= of_many(json.loads(path.read_text(encoding="utf-8")), kind)
+    if stores is not None:
+        found |= of_stores([json.loads(line) for line in stores.read_text(encoding="utf-8").splitlines()])
     where = {"machine": machine(), "at": f"{datetime.now(UTC):%Y-%m-%d}"}
     for one in found.values():
         MeasuredFigure(**one | where)  # checks itself
-    told = {name: one | where for name, one in found.items()}
+    told = json.loads(OUT.read_text(encoding="utf-8")) | {name: one | where for name, one in found.items()}
     OUT.write_text(json.dumps(told, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
@@ -77,7 +85,7 @@ def of_many(told: dict[str, Any], kind: str) -> dict[str, dict[str, Any]]:
     by_name = {one["name"]: one for one in told["figures"]}
     on_disk = by_name["on the disk"]
     row_bytes = on_disk["value"] - int(on_disk["detail"].split(" tiles with ")[1].split()[0])
-    command = MANY + PLACES[kind]
+    command = MANY.format(*PLACES[kind])
     found = {f"{kind}: {name}": _figure(one["value"], one["unit"], command) for name, one in by_name.items()}
     return found | {f"{kind}: row_B": _figure(row_bytes, "B", command)}
 
