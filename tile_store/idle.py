@@ -8,14 +8,14 @@ from typing import Generic, Protocol, TypeVar
 from gnd.tile_store.errors import NO_ROW, StoreClosed, odd_row
 
 
-class Closable(Protocol):
+class IdleConnection(Protocol):
     """What a connection must be able to do."""
 
     def close(self) -> object:
         """Free it."""
 
 
-C = TypeVar("C", bound=Closable)
+C = TypeVar("C", bound=IdleConnection)
 
 
 class IdleConnections(Generic[C]):

@@ -1,18 +1,20 @@
 """Reports a second over their whole way, with a store in a file and in PostgreSQL in turns, or with 1, 2 and 4 shards.
 
     python -m studies.scale.rates --store postgresql://…/empty_database --rounds 3 (as root)
-    python -m studies.scale.rates --shards 1,2,4 --share 0.2 --rounds 3 (as root)
+    python -m studies.scale.rates --shards 1,2,4 --share 0.15 --vehicles 10 --each (as root)
 
 A load (`gnd load`) offers more than the cloud can do; counted are its reports from the first one sent until nothing
 waits any more: acknowledged, journaled, merged, published and told. All processes, the database server too, share the
 last cores of the machine, on which they go before everybody else (control groups). With `--share` each shard with its
-worker gets so much of a core and no more, so that the shards are the limit, whatever else the machine does. DATABASE is
-emptied before each run.
+worker gets so much of a core and no more, so that the shards are the limit, whatever else the machine does. What a
+report costs falls with what waits, as several reports about a tile are merged together; with `--each` a shard has as
+many vehicles whatever their number, so that as much waits for each. DATABASE is emptied before each run.
 """
 
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -34,6 +36,7 @@ from studies.scale.room import Room, room
 @click.option("--rounds", default=3, show_default=True, type=click.IntRange(1))
 @click.option("--cores", default=1, show_default=True, type=click.IntRange(1), help="That all share.")
 @click.option("--vehicles", default=60, show_default=True, type=click.IntRange(1))
+@click.option("--each", is_flag=True, help="So many vehicles for each shard, not for all.")
 @click.option("--km", default=0.4, show_default=True, type=click.FloatRange(0.1), help="Way of each vehicle.")
 @click.option("--drives", type=click.Path(path_type=Path), help="As `gnd load` has it.")
 @click.option("--settled", type=click.Path(path_type=Path), help="As `gnd load` has it.")
@@ -47,13 +50,16 @@ def main(
     km: float,
     drives: Path | None,
     settled: Path | None,
+    *,
+    each: bool,
 ) -> None:
     """Measure in turns, and print a line a run and one for all."""
     runs = kept_runs(drives, settled, Console(stderr=True))
     with room(cores) as made:
         if shards:
             counts = [int(one) for one in shards.split(",")]
-            _of_shards(_load(vehicles, km), counts, share, rounds, store, runs, made)
+            loads = [replace(_load(vehicles * (one if each else 1), km), shards=one) for one in counts]
+            _of_shards(loads, share, rounds, store, runs, made)
         else:
             _of_stores(_load(vehicles, km), rounds, store, runs, made)
 
@@ -79,18 +85,16 @@ def _of_stores(setting: LoadSetting, rounds: int, store: str, runs: KeptRuns, ma
     )
 
 
-def _of_shards(
-    setting: LoadSetting, counts: Sequence[int], share: float, rounds: int, store: str, runs: KeptRuns, made: Room
-) -> None:
-    rates: dict[int, list[float]] = {count: [] for count in counts}
+def _of_shards(loads: Sequence[LoadSetting], share: float, rounds: int, store: str, runs: KeptRuns, made: Room) -> None:
+    rates: dict[LoadSetting, list[float]] = {one: [] for one in loads}
     for number in range(rounds):
-        for count in counts[:: -1 if number % 2 else 1]:
-            one = LoadSetting("compared", setting.vehicles, setting.changed_share, count, setting.kmh, setting.km)
-            rates[count].append(_told(measured(one, store or None, runs, made, share)).reports_per_s)
-    for count in counts[1:]:
-        pairs = zip(rates[counts[0]], rates[count], strict=True)
+        for one in loads[:: -1 if number % 2 else 1]:
+            rates[one].append(_told(measured(one, store or None, runs, made, share)).reports_per_s)
+    first = loads[0]
+    for other in loads[1:]:
+        pairs = zip(rates[first], rates[other], strict=True)
         _say(
-            f"{count} shards over {counts[0]}, worst, median, best",
+            f"{other.shards} shards over {first.shards}, worst, median, best",
             reports_per_s=_ends([many / one for one, many in pairs]),
         )
 
