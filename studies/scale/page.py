@@ -241,7 +241,8 @@ def _figures(figures: Mapping[str, MeasuredFigure]) -> str:
     for name, one in figures.items():
         commands.setdefault((one.command, one.at, one.machine), []).append(name)
     return "\n".join(
-        f"- `{command}` ({at}; {machine}): {len(names)} figures" for (command, at, machine), names in commands.items()
+        f"- `{command}` ({at}; {machine}): {len(names)} figure{'s' * (len(names) > 1)}"
+        for (command, at, machine), names in commands.items()
     )
 
 
