@@ -31,6 +31,7 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.health import HealthServer
 from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.refusals import RefusalsTold, show_refusals
+from gnd.tile_store.districts import KnownOwners
 from gnd.tile_store.errors import StoreClosed, StoreError
 from gnd.tile_store.location import open_store
 from gnd.tile_store.metrics import store_checks
@@ -77,9 +78,10 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
             admission = Admission(store)
             # look at the outside, keep the bytes
             ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission, words=words)
-            members = Members(config.shard_id, KnownDistricts(store))
+            owners = KnownOwners(store)
+            members = Members(config.shard_id, KnownDistricts(store), owners)
             follow_revoked(bus)
-            states.open()
+            states.open(are_several=owners().are_several)
             reception = Reception(bus, members, ingest.answer, store.release, KnownShards(store).has)
             reception.open()
             _LOG.info("merger %s: store %s, mode %s", config.shard_id, store.location, config.merge.mode)
@@ -87,6 +89,7 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
             while not stop.wait(config.poll_s):
                 reception.look_again()
                 states.tell_kept()
+                states.open(are_several=owners().are_several)
                 told.tell()
                 if worker.has_ended():
                     store.release(config.shard_id)  # what it had in hand need not wait for the ends of its leases
@@ -129,7 +132,7 @@ def run_worker(
             register_certificate(metrics.registry, bus.certificate)
             checks = {**store_checks(store, bus), **certificate_checks(bus.certificate)}
             stack.enter_context(HealthServer(port, metrics.registry, checks, host=host))
-        members, wake = following(bus, config.shard_id, KnownDistricts(store)), threading.Event()
+        members, wake = following(bus, config.shard_id, KnownDistricts(store), KnownOwners(store)), threading.Event()
 
         # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.
         bases = Bases(store)  # what one has decoded or made, the others need next

@@ -5,6 +5,9 @@ highest hash of (member, district) gets the district, unless it has its share al
 than its districts move. Districts that the map does not have yet go by the hash alone.
 Ownership spreads the ingest and keeps caches warm. It protects nothing: that is the store's compare-and-swap. So
 members may differ for some seconds in what they know: two acknowledge a report, or nobody does and it is sent again.
+
+Where several stores share a map, all that is among the shards of one store, about the districts that it owns; what has
+moved to another is nobody's here, and the store refuses it whatever a shard believes.
 """
 
 import logging
@@ -18,6 +21,7 @@ from typing import Final
 from gnd.fleet_bus.bus import Bus
 from gnd.gnd_map.tile_id import District
 from gnd.schemas.keys import alive_keys, parse_alive_key
+from gnd.tile_store.districts import KnownOwners, OwnsAll
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.store import Store
 
@@ -83,10 +87,17 @@ class Members:
     Args:
         own: name of this shard.
         districts: gives the districts of the map; the same object as long as they are the same.
+        owners: which districts the store owns; None: all.
     """
 
-    def __init__(self, own: str, districts: Callable[[], frozenset[District]] = no_districts) -> None:
+    def __init__(
+        self,
+        own: str,
+        districts: Callable[[], frozenset[District]] = no_districts,
+        owners: KnownOwners | None = None,
+    ) -> None:
         self.own = own
+        self.owners = owners or KnownOwners(OwnsAll())
         self._districts = districts
         self._lock = threading.Lock()
         self._living = frozenset({own})
@@ -105,7 +116,9 @@ class Members:
             return self._living != before
 
     def is_mine(self, district: District) -> bool:
-        """Whether this shard owns the district among those that live."""
+        """Whether the store owns the district, and this shard among those that live."""
+        if not self.owners().takes(district):
+            return False
         living = self._living
         return (self._owners(living).get(district) or owner_of(district, living)) == self.own
 
@@ -167,9 +180,14 @@ class KnownDistricts:
             return self._districts
 
 
-def following(bus: Bus, own: str, districts: Callable[[], frozenset[District]] = no_districts) -> Members:
+def following(
+    bus: Bus,
+    own: str,
+    districts: Callable[[], frozenset[District]] = no_districts,
+    owners: KnownOwners | None = None,
+) -> Members:
     """The members as they come and go from now on, for who only wants to know whose a district is."""
-    members = Members(own, districts)
+    members = Members(own, districts, owners)
 
     def note(key: str, alive: bool) -> None:
         members.note(parse_alive_key(key)[1], alive=alive)

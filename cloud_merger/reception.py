@@ -4,6 +4,9 @@ The router hands a report to a complete queryable alone. Of a district that has 
 just died) every shard's fallback hears; there, only the shard that now owns the district answers, and from then on
 declares it. So there is one ack in normal operation; while the views of who lives differ, none (the vehicle asks
 again) or two (storing twice has no effect).
+
+A district that moves to another store is busy for a moment: the store refuses it, and the vehicle is told to come back
+soon. Then it is given up here, and the shards of the other store hear it.
 """
 
 import logging
@@ -14,7 +17,7 @@ from typing import Final
 
 from gnd.cloud_merger.ownership import ROLE, Members
 from gnd.fleet_bus.bus import Bus
-from gnd.fleet_bus.errors import NotMine
+from gnd.fleet_bus.errors import Busy, NotMine
 from gnd.fleet_bus.seals import Holder
 from gnd.fleet_bus.serving import Request, Serving
 from gnd.gnd_map.tile_id import District
@@ -22,12 +25,15 @@ from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
 from gnd.schemas.upload_peek import peek_upload
+from gnd.tile_store.errors import DistrictElsewhere
 
 MAX_DECLARED: Final = 4096
 MAX_TOKENS: Final = 4096
 """Names of tokens that are remembered until the store knows them."""
 REMEMBERED_REPORTS: Final = 65_536
 """Report ids whose vehicle is remembered."""
+MOVING_RETRY_S: Final = 0.1
+"""Who speaks of a district that is just moving is to come back after so long."""
 WORKERS: Final = 32  # threads of all of them: acks that come at the same time share a commit
 _LOG = logging.getLogger(__name__)
 
@@ -103,7 +109,12 @@ class Reception:
         return self._answered(request).encode()
 
     def _answered(self, request: Request) -> ChangeAck:
-        ack = self._answer(request.key, request.payload, request.asker)
+        try:
+            ack = self._answer(request.key, request.payload, request.asker)
+        except DistrictElsewhere as error:
+            self._members.owners.looked_again()
+            self._give_up_foreign()
+            raise Busy(str(error), MOVING_RETRY_S, "moving") from None
         if ack.status != "quarantined":
             self._turns.note(request.payload)
         return ack
@@ -112,6 +123,8 @@ class Reception:
         place = _place(request.key)
         if place is None:
             return self._own(request)  # nobody owns such a key; the answer says why it is refused
+        if self._members.owners().state(place[1]) == "leaving":
+            raise Busy(f"district {place[1]} is just moving to another store", MOVING_RETRY_S, "moving")
         if place in self._declared or not self._members.is_mine(place[1]):
             raise NotMine
         ack = self._answered(request)

@@ -22,7 +22,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
-from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownReports
+from gnd.tile_store.errors import DistrictElsewhere, StoreDamaged, StoreError, UnknownReports
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import (
     QUARANTINED,
@@ -88,13 +88,20 @@ class Worker:
         publications = [one for one in attempted if one is not None]
         try:
             results = iter(self._store.publish(publications))
-        except (StoreDamaged, UnknownReports):  # one of them is to blame; any other is the store's failure
+        except (
+            StoreDamaged,
+            UnknownReports,
+            DistrictElsewhere,
+        ):  # one of them is to blame; any other is the store's failure
             return [None if one is None else self._published(one) for one in attempted]
         return [None if one is None else next(results) for one in attempted]
 
     def _published(self, publication: Publication) -> PublishResult | None:
         try:
             (result,) = self._store.publish([publication])
+        except DistrictElsewhere as error:  # the other store merges it
+            _LOG.info("%s is not merged here: %s", publication.claim.tile, error)
+            return None
         except (StoreDamaged, UnknownReports) as error:
             self._failed(publication.claim, error)
             return None

@@ -30,6 +30,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "map": ("gnd.deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
     "shards": ("gnd.cloud_merger.shards_cli:shards", "Who merges a map: shards, their districts, their queues."),
+    "regions": (
+        "gnd.tile_store.regions_cli:regions",
+        "Stores that share a map: whose districts are, and moving them while vehicles drive.",
+    ),
     "vehicles": ("gnd.deploy.vehicles_cli:vehicles", "Whose reports count, why not, and who decides it."),
     "release": ("gnd.deploy.release_cli:release", "See and steer new versions on trial with a share of the fleet."),
     "view": ("gnd.deploy.map_export.view:view", "Show a map, its changes and its fleet in Rerun."),

@@ -94,19 +94,29 @@ class Serving(Part):
     ) -> None:
         super().__init__()
         self._turn_of = turn_of or _key_of
+        self._is_retired = False
         self._connection, self._handler, self._kind = connection, handler, kind
         self._own: list[InTurn[_Asked]] = []
         if beside is None:
             self._own.append(InTurn(f"serve {keyexpr}", _answer, workers, QUEUE_LIMIT))
         self._workers: InTurn[_Asked] = self._own[0] if beside is None else beside._workers
-        self._regions = self._workers
-        if "*" in keyexpr:
+        self._regions: InTurn[_Asked] = self._workers if beside is None else beside._regions
+        if "*" in keyexpr and beside is None:
             self._regions = InTurn(f"regions {keyexpr}", _answer, 1, REGIONS_WAITING)
             self._own.append(self._regions)
         self.declare(connection, lambda session: session.declare_queryable(keyexpr, self._accept, complete=complete))
 
+    def retire(self) -> None:
+        """Hear nothing more; what has come is answered, until `close`."""
+        if self.declared is None:
+            self.close()
+        elif not self._is_retired:
+            self._is_retired = True
+            self.undeclare()
+
     def _end(self) -> None:
-        self.undeclare()
+        if not self._is_retired:
+            self.undeclare()
         for workers in self._own:
             workers.close()
 

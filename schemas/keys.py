@@ -146,6 +146,15 @@ def catalog_keys(layer: str, prefix: str = "") -> str:
     return f"{ROOT}/catalog/{_layer(layer)}/{_region('/'.join(prefix.split('/')[:3]))}"
 
 
+def district_keys(district: District) -> tuple[str, str, str]:
+    """Keys of all layers in one district: its tiles, several of them at once, its catalogs."""
+    return (
+        f"{ROOT}/tile/*/{district.path}/**",
+        f"{ROOT}/tiles/*/{district.path}",
+        f"{ROOT}/catalog/*/{district.path}",
+    )
+
+
 def change_key(layer: str, district: District) -> str:
     """Where a report over a district's tiles is sent."""
     return f"{ROOT}/change/{_layer(layer)}/{district.path}"

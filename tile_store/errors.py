@@ -7,6 +7,7 @@ StoreDamaged       a part of it cannot be read
 StoreAway          the server of its database does not answer, or starts or stops
 StoreBusy            another process has held the write lock for too long
 StoreMoved         it was copied to another database, which is used instead
+DistrictElsewhere    a district that the store does not own, or that is just moving: nothing was written
 StoreClosed          it was used after close()
 NotPublished         signed versions, and nobody to sign another one
 UnknownVersion       the tile has no such version
@@ -48,6 +49,20 @@ class StoreMoved(StoreUnavailable):
     def __init__(self, location: str, line: str) -> None:
         self.target = line.partition("moved to ")[2].split(" CONTEXT:")[0].strip()
         super().__init__(f"{location}: moved to {self.target}; nothing was written, start this with that store")
+
+
+class DistrictElsewhere(StoreError):
+    """The district is another store's, or is just moving to it: nothing was written here; who asked is to ask again."""
+
+    def __init__(self, location: str) -> None:
+        super().__init__(
+            f"{location}: nothing was written, as the district has moved to another store, or is just moving"
+            " (`gnd regions list`)"
+        )
+
+
+DISTRICT_REFUSED: Final = "a district that is not written to here"
+"""How the databases say it."""
 
 
 def odd_row(location: str, error: Exception) -> StoreDamaged:

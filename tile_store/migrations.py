@@ -34,10 +34,12 @@ STEPS: Final = (
     (15, "schema_of_standings"),
     (16, "schema_of_bodies"),
     (17, "schema_of_body_checks"),
+    (18, "schema_of_districts"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
-_TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks", "copy_notes_", "moved_away_")
-"""Triggers of a store; the last two begin the names of those of a copy (`copying`)."""
+_TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks", "copy_notes_", "moved_away_",
+                    "district_guard_")  # fmt: skip
+"""Triggers of a store; the last three begin the names of those of a copy and of districts' owners (`copying`)."""
 
 
 def schema_of(connection: apsw.Connection, path: Path) -> int:

@@ -16,6 +16,7 @@ from psycopg.pq.abc import PGresult
 
 from gnd.tile_store.connection import NOTHING, Bindings, Row
 from gnd.tile_store.errors import (
+    DistrictElsewhere,
     StoreAway,
     StoreBusy,
     StoreDamaged,
@@ -38,6 +39,8 @@ READER_PATIENCE_S: Final = 30.0
 CLOCK_READ_EVERY_S: Final = 10.0
 MOVED_STATE: Final = "GND01"
 """The code of PostgreSQL's error for a store that has moved."""
+ELSEWHERE_STATE: Final = "GND02"
+"""The same for a district of another store."""
 CLOCK_NAME: Final = "database"
 _SETTINGS: Final = (
     "SET client_min_messages = warning; SET jit = off; SET lock_timeout = '30s'; SET DateStyle = ISO; "
@@ -295,8 +298,9 @@ def as_store_error(error: Exception, location: str) -> Exception:
     if not isinstance(error, psycopg.Error):
         return error
     line = " ".join(str(error).split())[:300]
-    if error.diag.sqlstate == MOVED_STATE:
-        return StoreMoved(location, line)
+    if error.diag.sqlstate in (MOVED_STATE, ELSEWHERE_STATE):
+        moved = error.diag.sqlstate == MOVED_STATE
+        return StoreMoved(location, line) if moved else DistrictElsewhere(location)
     if isinstance(error, (pg.LockNotAvailable, pg.DeadlockDetected, pg.SerializationFailure, pg.QueryCanceled)):
         return StoreBusy(f"{location}: other writers have held a lock for too long; try again ({line})")
     if isinstance(error, pg.InsufficientPrivilege):

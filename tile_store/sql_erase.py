@@ -18,6 +18,7 @@ WHY: Final = "its name was erased while it did not count"
 _REMOVED: Final = (
     "uploads", "quarantined_messages", "shift_tests", "courses", "agreement_tests", "trial_health", "road_parts",
     "standings", "days_alone", "coincidences", "pairs_of_groups", "places", "impossible",
+    "border_rows",
 )  # fmt: skip
 """What is removed, as `counts_of` and the statements `erase_<name>` name it."""
 

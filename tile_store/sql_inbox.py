@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import sql_journal as journal
 from gnd.tile_store.connection import Lock, Row, SqlConnection, change, fetch, post
+from gnd.tile_store.districts import is_owned
 from gnd.tile_store.regions import morton_range
 from gnd.tile_store.rows_kept import RowsKept
 from gnd.tile_store.values import Claim, JournalMark, PutStatus, ReportRow, StoreConfig
@@ -142,7 +143,9 @@ def _versions_confirmed(c: SqlConnection, rows: Sequence[ReportRow]) -> dict[tup
 
 
 def merge_again(c: SqlConnection, layer: str, tile: TileId, timing: dict[str, Any]) -> None:
-    """Mark a tile dirty although no report has come."""
+    """Mark a tile dirty although no report has come; not one of a district that another store has."""
+    if not is_owned(c, tile.district):
+        return
     seq = journal.mark(c, layer, tile)
     c.post_each("mark_dirty", [{"layer": layer, "tile": tile.morton, "seq": seq}], timing)
 

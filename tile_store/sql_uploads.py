@@ -6,6 +6,7 @@ from hashlib import sha256
 from typing import Any, Final
 
 from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import borders
 from gnd.tile_store import sql_inbox as inbox
 from gnd.tile_store.connection import Lock, QueueClock, Row, SqlConnection, change, fetch, post
 from gnd.tile_store.errors import IdTaken
@@ -126,17 +127,19 @@ def settle(c: SqlConnection, settled: Settled, config: StoreConfig, timing: dict
         ImpossiblePlace: its vehicle cannot have been there.
     """
     claim, upload = settled.claim, settled.claim.upload
+    rows, foreign = borders.apart(c, upload.form, settled.rows)
     journal_id = settled.rows[0].report_id if settled.rows else ""
     told = {"state": settled.state, "wanted": settled.wanted, "reason": settled.reason, "journal_id": journal_id}
     statement = "wait_for_flags" if settled.state == "early" else "settle_upload"
-    put = inbox.begin_to_put(c, settled.rows)
+    put = inbox.begin_to_put(c, rows)
     if not change(c, statement, told | {"upload": claim.number, "token": claim.token}):
         return False
     if settled.place is not None and upload.vehicle:
         put_place(c, upload.vehicle, settled.place)
     if settled.is_impossible:
         post(c, "put_impossible", {"vehicle": upload.vehicle, "now": timing["now"], "why": settled.reason})
-    _check_vehicles(c, settled.rows, put(config, timing))
+    _check_vehicles(c, rows, put(config, timing))
+    borders.keep(c, foreign)
     if settled.first is not None:
         answered = {name: getattr(settled.first, name) for name in type(settled.first).__slots__}
         post(c, "answer_first_half", answered)

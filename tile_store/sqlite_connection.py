@@ -13,7 +13,15 @@ import apsw
 
 from gnd.tile_store import clocks
 from gnd.tile_store.connection import NOTHING, Bindings, Row
-from gnd.tile_store.errors import StoreBusy, StoreDamaged, StoreError, StoreMoved, StoreUnavailable
+from gnd.tile_store.errors import (
+    DISTRICT_REFUSED,
+    DistrictElsewhere,
+    StoreBusy,
+    StoreDamaged,
+    StoreError,
+    StoreMoved,
+    StoreUnavailable,
+)
 from gnd.tile_store.idle import IdleConnections
 from gnd.tile_store.migrations import SCHEMA_VERSION, migrate, schema_of
 from gnd.tile_store.sql import statements
@@ -76,6 +84,8 @@ def as_store_error(error: Exception, path: str | Path, *, to_write: bool = True)
         return StoreUnavailable(f"{path}: not a tile store (not an SQLite database); choose another path")
     if isinstance(error, (apsw.CantOpenError, apsw.ReadOnlyError, apsw.PermissionsError)):
         return StoreUnavailable(f"{path}: cannot be opened for writing; its folder must exist and be writable")
+    if isinstance(error, apsw.ConstraintError) and DISTRICT_REFUSED in str(error):
+        return DistrictElsewhere(str(path))
     if isinstance(error, apsw.ConstraintError) and "moved to " in str(error):
         return StoreMoved(str(path), str(error))
     if isinstance(error, apsw.FullError):

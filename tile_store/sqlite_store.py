@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol, Self, TypeVar
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District, TileId
 from gnd.schemas.tiles import CatalogEntry
-from gnd.tile_store import clocks
+from gnd.tile_store import borders, clocks
 from gnd.tile_store import sql_accounts as accounts
 from gnd.tile_store import sql_confirmation as confirmation
 from gnd.tile_store import sql_inbox as inbox
@@ -28,6 +28,7 @@ from gnd.tile_store import sql_versions as versions
 from gnd.tile_store.backup import copy_store
 from gnd.tile_store.bodies import Bodies, bodies_at, place_of_bodies
 from gnd.tile_store.connection import QueueClock, SqlConnection, Writer, change, fetch
+from gnd.tile_store.districts import DistrictOwners, DistrictState, owners_of_districts
 from gnd.tile_store.errors import StoreDamaged, StoreError, StoreMoved, UnknownVersion
 from gnd.tile_store.provenance import Provenance, decode_provenance
 from gnd.tile_store.regions import morton_range
@@ -715,12 +716,30 @@ class SqlStore(ABC):
         with self._readers.single() as c:
             return [layer for (layer,) in fetch(c, "layers")]
 
+    def district_owners(self) -> DistrictOwners:
+        """See `Store.district_owners`."""
+        with self._readers.single() as c:
+            return owners_of_districts(c)
+
     def districts(self) -> frozenset[District]:
         """See `Store.districts`."""
         with self._readers.snapshot() as c:
             layers = [layer for (layer,) in fetch(c, "layers")]
             found = {number for layer in layers for (number,) in fetch(c, "districts", {"layer": layer})}
         return frozenset(TileId(number * TILES_OF_DISTRICT).district for number in found)
+
+    def border_rows(self, n: int) -> list[ReportRow]:
+        """The oldest rows of reports that wait to be carried to the store that owns their districts."""
+        return self.look(lambda c: borders.waiting(c, n))
+
+    def forget_border_rows(self, rows: Sequence[ReportRow]) -> None:
+        """Forget rows that the other store has."""
+        self._writer.run(lambda c: borders.forget(c, rows))
+
+    def set_region(self, name: str, rest: DistrictState) -> None:
+        """Give the store's region a name, and say whose the districts are of which nothing else is said."""
+        row = {"region": name, "state": rest, "since_ns": self._now_ns()}
+        self._writer.run(lambda c: change(c, "put_rest", row))
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """See `Store.heads`."""

@@ -7,6 +7,7 @@ from typing import Protocol
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.tiles import CatalogEntry
+from gnd.tile_store.districts import DistrictOwners
 from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.trials import VersionTrial
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
@@ -340,6 +341,9 @@ class Store(Protocol):
 
     def districts(self) -> frozenset[District]:
         """The districts in which any layer holds tiles."""
+
+    def district_owners(self) -> DistrictOwners:
+        """Which districts this store owns, where several share a map."""
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """The newest versions of a region's tiles (a prefix of their path), sorted by tile."""

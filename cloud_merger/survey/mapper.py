@@ -25,7 +25,7 @@ from gnd.gnd_map.tile_id import TileId, covering_corridor
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.survey import SurveyReport
 from gnd.tile_store import clocks, sql_roads
-from gnd.tile_store.errors import StoreError
+from gnd.tile_store.errors import DistrictElsewhere, StoreError
 from gnd.tile_store.roads import OpenRoads, RoadTile
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_CODEC, lattice_named
@@ -142,7 +142,10 @@ class RoadMapper:
                   dict(piece.left_out), dict(piece.doubts))  # fmt: skip
         total = RoadsMapped()
         for one in fuse_piece(piece, before):
-            total = _sum(total, self._write(layer, one, piece, before, heads, known.get(one.tile)))
+            try:
+                total = _sum(total, self._write(layer, one, piece, before, heads, known.get(one.tile)))
+            except DistrictElsewhere as error:
+                _LOG.warning("the road in tile %s is not entered: %s", one.tile, error)
         return total
 
     def _published(

@@ -36,7 +36,7 @@ def _systemd_commands() -> list[list[str]]:
 
 def _documented_commands() -> list[list[str]]:
     """`gnd …` in code blocks and tables; what only a reader can fill in is replaced by something that parses."""
-    names = ("README.md", "docs/operations.md", "docs/commands.md", "docs/how_to/deploy.md")
+    names = ("README.md", "docs/operations.md", "docs/commands.md", "docs/how_to/deploy.md", "docs/how_to/regions.md")
     text = "\n".join((DEPLOY.parent / name).read_text() for name in names)
     lines = re.findall(r"^gnd ([^#\n]*)", text, re.M) + re.findall(r"`gnd ([a-z][^`]* [^`]*)`", text)
     return [shlex.split(line.replace("[", "").replace("]", "")) for line in lines]

@@ -1,7 +1,7 @@
 """What is copied of a store: its tables by the order in which rows may be written, and the columns that tell a row."""
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 Row = tuple[Any, ...]
 
@@ -57,6 +57,8 @@ ALL: Final = (
     Contents("road_work", ("layer",)),
     Contents("feature_source", ("name",)),
     Contents("publisher", ("signer",), ("signer",)),
+    Contents("district_owner", ("district",)),
+    Contents("border_row", (*_REPORT, "part")),
     Contents("body_place", ("number",)),
     Contents("body_going", ("sha", "codec_id"), ("sha",)),
     Contents("quarantine", ("sha",), ("sha",)),
@@ -69,3 +71,61 @@ FENCED: Final = (*(one.table for one in ALL), "queue_boot", "shard")
 """Tables to which a store that has moved takes no writes, also none of those that say that somebody is there."""
 MADE_WITH_THE_STORE: Final = ("trial_salt", "quarantine_size")
 """Tables of an empty store that hold a row."""
+
+
+@dataclass(frozen=True, slots=True)
+class DistrictPart:
+    """A table of which the rows of a district move to another store.
+
+    Attributes:
+        contents: with a key that means the same in both stores.
+        kind: "early": rows come while the district is still the other's; "late": with the switch, for somebody acts
+            upon them or they make the district visible; "upload": those that wait come late, the others early.
+        numbered: the column in which each store numbers rows by itself; "": none.
+        guarded: columns whose changes are refused where the district is not written to; (): of all. Leases are not.
+        keeps: whether rows may not be removed while the district leaves.
+    """
+
+    contents: Contents
+    kind: Literal["early", "late", "upload"] = "early"
+    numbered: str = ""
+    guarded: tuple[str, ...] = ()
+    keeps: bool = True
+
+    @property
+    def table(self) -> str:
+        """Its name."""
+        return self.contents.table
+
+
+_KEYS: Final = {one.table: one for one in ALL}
+OF_DISTRICT: Final = (
+    DistrictPart(_KEYS["tile_version"]),
+    DistrictPart(Contents("report", (*_REPORT, "part")), numbered="arrival"),
+    *(
+        DistrictPart(_KEYS[table])
+        for table in (
+            "tile_memory", "version_basis", "closed_window", "waiting_change", "shift_test", "course_said",
+            "agreement_test", "standing", "coincidence", "trial", "trial_health", "doubted_report", "road_tile",
+        )
+    ),
+    DistrictPart(
+        Contents("upload", ("sha",), ("sha",)),
+        "upload",
+        "upload",
+        ("state", "body", "wanted", "journal_id", "report_id"),
+    ),
+    DistrictPart(_KEYS["tile_head"], "late"),
+    DistrictPart(_KEYS["survey"], "late"),
+    DistrictPart(_KEYS["journal"], "late"),
+    DistrictPart(_KEYS["dirty"], "late", guarded=("seq", "waiting")),
+    DistrictPart(_KEYS["notice"], "late", keeps=False),
+)  # fmt: skip
+"""In the order in which rows may be written."""
+STAYS: Final = (
+    "merge_parameters", "publisher", "shifted_vehicle", "quarantined_vehicle", "pardon", "vehicle_owner", "alone_day",
+    "lone_word", "vehicle_group", "vehicle_place", "impossible_place", "trial_salt", "trial_steered", "road_part",
+    "road_work", "feature_source", "district_owner", "border_row", "body_place", "body_going",
+    "quarantine", "quarantine_size",
+)  # fmt: skip
+"""Tables of the whole store; `copying.district` says what a move tells the other store of them."""

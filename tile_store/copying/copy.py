@@ -75,6 +75,8 @@ def copy_store_online(source: End, target: End, progress: Progress) -> Copied:
     tiles = target.count("tile_head")
     with target.transaction():
         target.reveal()
+        if target.count("district_owner"):
+            target.guard()
         target.put_mark(copy_id, source.location, WHOLE, "")
     target.name_it()
     with source.reading(), target.reading():  # shards may write from here on: this is how both were at the switch
@@ -107,6 +109,11 @@ def abandon(source: End) -> bool:
 def _begin(source: End, target: End) -> tuple[str, bool]:
     """The copy's id, and whether it goes on with one that was interrupted."""
     here, there = source.marked(), target.marked()
+    if moving := source.run("SELECT path FROM district_owner WHERE state IN ('copying', 'leaving', 'arriving')"):
+        raise StoreError(
+            f"{source.location}: district {moving[0][0]} of it is moving; go on with that (`gnd regions move`), or"
+            " --abandon it"
+        )
     if here is not None and here[2] == WHOLE:  # it was a target itself, once
         here = None
     if here is not None and here[2] == MOVED:
@@ -149,13 +156,13 @@ def _copy_rows(source: End, target: End, copy_id: str, progress: Progress) -> in
         if place is not None and place["is_done"]:
             continue
         columns = _columns(source, target, one)
-        after = _key_of(one, place["after"]) if place is not None else ()
+        after = key_of(one, place["after"]) if place is not None else ()
         at = [columns.index(name) for name in one.key]
         rows = source.page(one, columns, after, BATCH)
         while True:
             is_done = len(rows) < BATCH
             after = tuple(rows[-1][i] for i in at) if rows else after
-            places[one.table] = {"after": _key_as_json(after), "is_done": is_done}
+            places[one.table] = {"after": key_as_json(after), "is_done": is_done}
             with target.transaction():
                 target.fill(one, columns, rows)
                 target.put_mark(copy_id, source.location, COPIED, json.dumps(places))
@@ -167,11 +174,13 @@ def _copy_rows(source: End, target: End, copy_id: str, progress: Progress) -> in
     return copied
 
 
-def _key_as_json(key: Row) -> list[Any]:
+def key_as_json(key: Row) -> list[Any]:
+    """A key as it is kept; bytes in hexadecimal."""
     return [one.hex() if isinstance(one, bytes) else one for one in key]
 
 
-def _key_of(contents: Contents, told: list[Any]) -> Row:
+def key_of(contents: Contents, told: list[Any]) -> Row:
+    """The key that was kept so."""
     pairs = zip(contents.key, told, strict=False)
     return tuple(bytes.fromhex(value) if name in contents.hashes else value for name, value in pairs)
 
@@ -215,7 +224,7 @@ def _changed_rows(source: End, target: End, notes: list[Row]) -> list[Changed]:
     """The rows that notes speak of, as they are now, and the keys of those that are gone, by table in their order."""
     keys: dict[str, set[Row]] = {}
     for _, table, key in notes:
-        keys.setdefault(table, set()).add(_key_of(_BY_TABLE[table], json.loads(key)))
+        keys.setdefault(table, set()).add(key_of(_BY_TABLE[table], json.loads(key)))
     changed = []
     for one in ALL:
         if one.table not in keys:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
 
+from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District
 from gnd.tile_store.copying.contents import ALL, MADE_WITH_THE_STORE, Contents, Row
 
 LOG: Final = "copy_change"
@@ -17,6 +18,7 @@ WHOLE: Final = "whole"
 """States of a copy: both ends while it goes on; a source that writes nothing more; a target that is a store."""
 NOTE: Final = "copy_notes"
 REFUSE: Final = "moved_away"
+GUARD: Final = "district_guard"
 """Triggers begin with these words."""
 EVENTS: Final = ("insert", "update", "delete")
 
@@ -47,8 +49,8 @@ class End(ABC):
         """The columns of a table, sorted, under the names that both databases use; none: there is no such table."""
 
     @abstractmethod
-    def note_changes(self) -> None:
-        """Have every change of a row noted in the log from now on, inside a transaction."""
+    def note_changes(self, which: Sequence[Contents] = ALL, district: District | None = None) -> None:
+        """Have every change of a row noted in the log from now on, inside a transaction; of a district, its rows'."""
 
     @abstractmethod
     def stop_noting(self) -> None:
@@ -61,6 +63,16 @@ class End(ABC):
     @abstractmethod
     def allow(self) -> None:
         """Refuse nothing more."""
+
+    @abstractmethod
+    def guard(self) -> None:
+        """Have writes to districts refused that `district_owner` says are not written to here, inside a transaction.
+        It stays; a store that owns all its districts has no guard.
+        """
+
+    @abstractmethod
+    def key_ends(self, column: str, path: str) -> str:
+        """A condition: the key of a report ends with the path of a district."""
 
     @abstractmethod
     def begin(self, *, alone: bool = False) -> None:
@@ -109,6 +121,32 @@ class End(ABC):
             yield
         finally:
             self.run("ROLLBACK")
+
+    def of_district(self, table: str, district: District | None, row: str = "") -> str:
+        """A condition: a row is of a district; `row`: "NEW." or "OLD." in a trigger."""
+        if district is None:
+            return "1 = 1"
+        if table == "upload":
+            return self.key_ends(f"{row}key", district.path)
+        first = district.first_morton
+        return f"{row}tile >= {first} AND {row}tile < {first + TILES_OF_DISTRICT}"
+
+    def layers(self, table: str) -> list[str]:
+        """The layers of a table whose index begins with them: as many steps as layers."""
+        found, sql = list[str](), f"SELECT MIN(layer) FROM {table}"
+        rows = self.run(sql)
+        while rows[0][0] is not None:
+            found.append(str(rows[0][0]))
+            rows = self.run(f"{sql} WHERE layer > {self.mark}", (found[-1],))
+        return found
+
+    def in_district(self, table: str, district: District) -> str:
+        """A condition for a district's rows, by which an index finds them."""
+        here = self.of_district(table, district)
+        if table == "upload":
+            return here
+        layers = ", ".join("'" + one.replace("'", "''") + "'" for one in self.layers(table))
+        return f"layer IN ({layers}) AND {here}" if layers else "1 = 0"
 
     def name(self, column: str) -> str:
         """A column in a statement: some are reserved words."""

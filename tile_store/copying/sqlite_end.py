@@ -7,9 +7,11 @@ from typing import Any, Final
 
 import apsw
 
-from gnd.tile_store.copying.contents import ALL, FENCED, Contents, Row
-from gnd.tile_store.copying.ends import EVENTS, LOG, MARK, NOTE, REFUSE, End
-from gnd.tile_store.errors import StoreError, StoreUnavailable
+from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District
+from gnd.tile_store.copying.contents import ALL, FENCED, OF_DISTRICT, Contents, DistrictPart, Row
+from gnd.tile_store.copying.ends import EVENTS, GUARD, LOG, MARK, NOTE, REFUSE, End
+from gnd.tile_store.districts import REST, WRITTEN
+from gnd.tile_store.errors import DISTRICT_REFUSED, StoreError, StoreUnavailable
 from gnd.tile_store.migrations import SCHEMA_VERSION, schema_of
 from gnd.tile_store.sqlite_connection import open_reader, open_writer
 
@@ -70,14 +72,16 @@ class SqliteEnd(End):
         found = [str(name) for (name,) in self._connection.execute(f"SELECT name FROM pragma_table_info('{table}')")]
         return tuple(sorted([*found, "number"] if table == "trial_steered" else found))
 
-    def note_changes(self) -> None:
+    def note_changes(self, which: Sequence[Contents] = ALL, district: District | None = None) -> None:
         """See `End`."""
         self.run(
             f"CREATE TABLE IF NOT EXISTS {LOG} (number INTEGER PRIMARY KEY AUTOINCREMENT, what TEXT NOT NULL,"
             " key TEXT NOT NULL) STRICT"
         )
-        for one, event in product(ALL, EVENTS):
-            told = " UNION ".join(_noted(one, row) for row in _ROWS[event])
+        for one, event in product(which, EVENTS):
+            told = " UNION ".join(
+                f"{_noted(one, row)} WHERE {self.of_district(one.table, district, f'{row}.')}" for row in _ROWS[event]
+            )
             self.run(
                 f"CREATE TRIGGER {NOTE}_{event}_{one.table} AFTER {event} ON {one.table} BEGIN"
                 f" INSERT INTO {LOG} (what, key) {told}; END"
@@ -101,6 +105,21 @@ class SqliteEnd(End):
         """See `End`."""
         for table, event in product(FENCED, EVENTS):
             self.run(f"DROP TRIGGER IF EXISTS {REFUSE}_{event}_{table}")
+
+    def guard(self) -> None:
+        """See `End`."""
+        for part, event in product(OF_DISTRICT, EVENTS):
+            if event == "delete" and not part.keeps:
+                continue
+            of = f" OF {self.listed(part.guarded)}" if event == "update" and part.guarded else ""
+            self.run(  # an expression in RAISE would make the file unreadable for programs with an older SQLite
+                f"CREATE TRIGGER IF NOT EXISTS {GUARD}_{event}_{part.table} BEFORE {event}{of} ON {part.table}"
+                f" WHEN {_refused(part, event)} BEGIN SELECT RAISE(ABORT, '{DISTRICT_REFUSED}'); END"
+            )
+
+    def key_ends(self, column: str, path: str) -> str:
+        """See `End`."""
+        return f"substr({column}, -{len(path)}) = '{path}'"
 
     def begin(self, *, alone: bool = False) -> None:  # noqa: ARG002  # whoever writes is alone
         """See `End`."""
@@ -144,6 +163,27 @@ _ROWS: Final = {"insert": ("NEW",), "update": ("OLD", "NEW"), "delete": ("OLD",)
 def _noted(contents: Contents, row: str) -> str:
     parts = [f'hex({row}."{one}")' if one in contents.hashes else f'{row}."{one}"' for one in contents.key]
     return f"SELECT '{contents.table}', json_array({', '.join(parts)})"
+
+
+def _refused(part: DistrictPart, event: str) -> str:
+    """The condition that an event is refused for the district of a row."""
+    row = "OLD" if event == "delete" else "NEW"
+    column, place = (
+        ("path", f"substr({row}.key, -17)")
+        if part.kind == "upload"
+        else ("district", f"({row}.tile / {TILES_OF_DISTRICT})")
+    )
+    state = (
+        f"COALESCE((SELECT state FROM district_owner WHERE {column} = {place}),"
+        f" (SELECT state FROM district_owner WHERE district = {REST}), 'owned')"
+    )
+    if event == "delete":
+        return f"{state} = 'leaving'"
+    written = ", ".join(f"'{one}'" for one in (*WRITTEN, *(() if part.kind == "late" else ("arriving",))))
+    is_refused = f"{state} NOT IN ({written})"
+    if part.kind == "upload" and event == "insert":  # what waits comes late
+        is_refused += f" OR ({state} = 'arriving' AND NEW.state = 'waiting')"
+    return is_refused
 
 
 def _with_rowid(sql: str) -> str:

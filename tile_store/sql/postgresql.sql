@@ -494,6 +494,32 @@ CREATE INDEX tile_version_elsewhere ON tile_version (sha, codec_id) WHERE length
 -- Step 17, likewise.
 ALTER TABLE tile_version ADD COLUMN body_check bytea CHECK (body_check IS NULL OR length(body_check) = 16);
 
+-- name: schema_of_districts
+-- Step 18, likewise.
+CREATE TABLE district_owner (
+  district bigint NOT NULL PRIMARY KEY CHECK (district >= -1),
+  path     text COLLATE "C" NOT NULL UNIQUE,
+  region   text COLLATE "C" NOT NULL,
+  state    text COLLATE "C" NOT NULL CHECK (state IN ('owned', 'copying', 'leaving', 'moved', 'arriving')),
+  other    text COLLATE "C" NOT NULL,
+  since_ns bigint NOT NULL,
+  epoch    bigint NOT NULL,
+  move_id  text COLLATE "C" NOT NULL,
+  place    text COLLATE "C" NOT NULL
+);
+CREATE TABLE border_row (
+  layer       text COLLATE "C" NOT NULL,
+  tile        bigint NOT NULL,
+  report_id   text COLLATE "C" NOT NULL,
+  part        bigint NOT NULL,
+  vehicle     text COLLATE "C" NOT NULL,
+  received_ns bigint NOT NULL,
+  base_sha    bytea  NOT NULL,
+  body        bytea  NOT NULL,
+  PRIMARY KEY (layer, tile, report_id, part)
+);
+CREATE INDEX border_row_received ON border_row (received_ns);
+
 -- name: store_lock
 SELECT store_lock(:store::integer, :alone <> 0, :parts::bigint[]::integer[])
 
@@ -641,6 +667,8 @@ DELETE FROM quarantined_vehicle WHERE vehicle = :vehicle AND (source = 'agreemen
 -- name: claimable
 SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL, ready_ns FROM dirty
 WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
+  AND COALESCE((SELECT state FROM district_owner WHERE district = dirty.tile / 1024),
+      (SELECT state FROM district_owner WHERE district = -1), 'owned') IN ('owned', 'copying')
   AND NOT EXISTS (SELECT 1 FROM trial AS t WHERE t.state IN ('trial', 'paused')
     AND t.layer = dirty.layer AND t.tile = dirty.tile)
 ORDER BY ready_ns, layer, tile LIMIT :n FOR UPDATE OF dirty SKIP LOCKED
@@ -659,7 +687,9 @@ WHERE NOT EXISTS (SELECT 1 FROM report WHERE layer = :layer AND tile = :tile AND
 
 -- name: next_ready
 SELECT MIN(CASE WHEN owner IS NULL THEN ready_ns ELSE GREATEST(ready_ns, lease_ns) END) FROM dirty
-WHERE NOT EXISTS (SELECT 1 FROM trial AS t WHERE t.state IN ('trial', 'paused')
+WHERE COALESCE((SELECT state FROM district_owner WHERE district = dirty.tile / 1024),
+      (SELECT state FROM district_owner WHERE district = -1), 'owned') IN ('owned', 'copying')
+  AND NOT EXISTS (SELECT 1 FROM trial AS t WHERE t.state IN ('trial', 'paused')
     AND t.layer = dirty.layer AND t.tile = dirty.tile)
 
 -- name: insert_quarantine
@@ -682,11 +712,15 @@ ON CONFLICT (sha) DO NOTHING RETURNING sha
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload
 WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle
   AND (home = :home OR boot <> :boot OR lease_ns <= :now OR lease_ns > :never)
+  AND COALESCE((SELECT o.state FROM district_owner AS o WHERE o.path = right(key, 17)),
+      (SELECT o.state FROM district_owner AS o WHERE o.district = -1), 'owned') IN ('owned', 'copying')
 ORDER BY upload LIMIT :n FOR UPDATE SKIP LOCKED
 
 -- name: free_uploads
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload
 WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) AND attempts >= :attempts
+  AND COALESCE((SELECT o.state FROM district_owner AS o WHERE o.path = right(key, 17)),
+      (SELECT o.state FROM district_owner AS o WHERE o.district = -1), 'owned') IN ('owned', 'copying')
 ORDER BY attempts, upload LIMIT :n FOR UPDATE SKIP LOCKED
 
 -- name: postpone_upload

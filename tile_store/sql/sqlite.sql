@@ -623,6 +623,8 @@ ON CONFLICT (layer, tile) DO UPDATE SET
 -- name: claimable
 SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL, ready_ns FROM dirty INDEXED BY dirty_ready
 WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
+  AND COALESCE((SELECT state FROM district_owner WHERE district = dirty.tile / 1024),
+      (SELECT state FROM district_owner WHERE district = -1), 'owned') IN ('owned', 'copying')
   -- a version of it is on trial: what is reported meanwhile waits for the verdict
   AND NOT EXISTS (SELECT 1 FROM trial AS t INDEXED BY trial_open WHERE t.state IN ('trial', 'paused')
     AND t.layer = dirty.layer AND t.tile = dirty.tile)
@@ -696,7 +698,10 @@ INSERT INTO notice (layer, tile, version, created_ns) VALUES (:layer, :tile, :ve
 DELETE FROM notice WHERE layer = :layer AND tile = :tile AND version = :version
 
 -- name: notices
-SELECT layer, tile, version FROM notice WHERE created_ns <= :before ORDER BY created_ns, layer, tile, version LIMIT :n
+SELECT layer, tile, version FROM notice WHERE created_ns <= :before
+  AND COALESCE((SELECT state FROM district_owner WHERE district = tile / 1024),
+      (SELECT state FROM district_owner WHERE district = -1), 'owned') IN ('owned', 'copying')
+ORDER BY created_ns, layer, tile, version LIMIT :n
 
 -- name: stored_version
 SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns, body_check,
@@ -770,7 +775,9 @@ SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL
 
 -- name: next_ready
 SELECT MIN(CASE WHEN owner IS NULL THEN ready_ns ELSE MAX(ready_ns, lease_ns) END) FROM dirty
-WHERE NOT EXISTS (SELECT 1 FROM trial AS t INDEXED BY trial_open WHERE t.state IN ('trial', 'paused')
+WHERE COALESCE((SELECT state FROM district_owner WHERE district = dirty.tile / 1024),
+      (SELECT state FROM district_owner WHERE district = -1), 'owned') IN ('owned', 'copying')
+  AND NOT EXISTS (SELECT 1 FROM trial AS t INDEXED BY trial_open WHERE t.state IN ('trial', 'paused')
     AND t.layer = dirty.layer AND t.tile = dirty.tile)
 
 -- name: insert_quarantine
@@ -872,6 +879,8 @@ SELECT vehicle FROM turn WHERE vehicle IS NOT NULL LIMIT :n
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_turn
 WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle
   AND (home = :home OR boot <> :boot OR lease_ns <= :now OR lease_ns > :never)
+  AND COALESCE((SELECT o.state FROM district_owner AS o WHERE o.path = substr(key, -17)),
+      (SELECT o.state FROM district_owner AS o WHERE o.district = -1), 'owned') IN ('owned', 'copying')
 ORDER BY upload LIMIT :n
 
 -- name: any_fresh_upload
@@ -887,6 +896,8 @@ SELECT COUNT(*) FROM (SELECT 1 FROM upload INDEXED BY upload_waiting WHERE state
 -- name: free_uploads
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_waiting
 WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) AND attempts >= :attempts
+  AND COALESCE((SELECT o.state FROM district_owner AS o WHERE o.path = substr(key, -17)),
+      (SELECT o.state FROM district_owner AS o WHERE o.district = -1), 'owned') IN ('owned', 'copying')
 ORDER BY attempts, upload LIMIT :n
 
 -- name: any_free_upload
@@ -1744,3 +1755,60 @@ UPDATE tile_version SET body = :body WHERE layer = :layer AND tile = :tile AND v
 -- name: copy_has_begun
 -- Whether the store notes its changes for a copy, or has moved.
 SELECT 1 FROM sqlite_schema WHERE type = 'trigger' AND (name LIKE 'copy\_notes\_%' ESCAPE '\' OR name LIKE 'moved\_away\_%' ESCAPE '\') LIMIT 1
+
+-- name: schema_of_districts
+-- Step of the schema. Whose districts are: a district's number is that of its tiles / 1024; -1 stands for all that have no
+-- row. Without any row the store has all. `place` is how far a move has come, `other` the store at its other end.
+CREATE TABLE district_owner (
+  district INTEGER NOT NULL PRIMARY KEY CHECK (district >= -1),
+  path     TEXT    NOT NULL UNIQUE,
+  region   TEXT    NOT NULL,
+  state    TEXT    NOT NULL CHECK (state IN ('owned', 'copying', 'leaving', 'moved', 'arriving')),
+  other    TEXT    NOT NULL,
+  since_ns INTEGER NOT NULL,
+  epoch    INTEGER NOT NULL,
+  move_id  TEXT    NOT NULL,
+  place    TEXT    NOT NULL
+) STRICT;
+-- What a report about features says of tiles across the border of a district of another store, until it is carried there.
+CREATE TABLE border_row (
+  layer       TEXT    NOT NULL,
+  tile        INTEGER NOT NULL,
+  report_id   TEXT    NOT NULL,
+  part        INTEGER NOT NULL,
+  vehicle     TEXT    NOT NULL,
+  received_ns INTEGER NOT NULL,
+  base_sha    BLOB    NOT NULL,
+  body        BLOB    NOT NULL,
+  PRIMARY KEY (layer, tile, report_id, part)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX border_row_received ON border_row (received_ns);
+
+-- name: put_border_row
+INSERT INTO border_row (layer, tile, report_id, part, vehicle, received_ns, base_sha, body)
+VALUES (:layer, :tile, :report_id, :part, :vehicle, :received_ns, :base_sha, :body) ON CONFLICT DO NOTHING
+
+-- name: border_rows
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part FROM border_row
+ORDER BY received_ns, layer, tile, report_id, part LIMIT :n
+
+-- name: count_border_rows
+SELECT COUNT(*) FROM border_row WHERE :vehicle = '' OR vehicle = :vehicle
+
+-- name: forget_border_row
+DELETE FROM border_row WHERE layer = :layer AND tile = :tile AND report_id = :report_id AND part = :part
+
+-- name: erase_border_rows
+DELETE FROM border_row WHERE vehicle = :vehicle
+
+-- name: district_owners
+SELECT district, path, region, state, other, since_ns, epoch FROM district_owner ORDER BY district
+
+-- name: put_rest
+INSERT INTO district_owner (district, path, region, state, other, since_ns, epoch, move_id, place)
+VALUES (-1, '', :region, :state, '', :since_ns, 0, '', '')
+ON CONFLICT (district) DO UPDATE SET region = excluded.region, state = excluded.state
+
+-- name: state_of_district
+SELECT COALESCE((SELECT state FROM district_owner WHERE district = :district),
+                (SELECT state FROM district_owner WHERE district = -1), 'owned')
