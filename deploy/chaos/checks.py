@@ -20,6 +20,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.tile_store.check import check_store
 from gnd.tile_store.connection import SqlConnection, fetch
+from gnd.tile_store.location import StoreLocation
 from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.vehicle_agent.link.outbox import Outbox
 
@@ -223,7 +224,7 @@ def _unmerged(c: SqlConnection) -> list[tuple[int, str]]:
     return queued + forgotten
 
 
-def verified(store: Path) -> tuple[dict[str, int], bool]:
+def verified(store: StoreLocation) -> tuple[dict[str, int], bool]:
     """What `gnd map verify` says, in a process of its own: its counts, and whether all that was merged is the same."""
     command = [sys.executable, "-m", "gnd.deploy.cli", "map", "verify", str(store), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - nothing in it is given

@@ -18,6 +18,7 @@ from gnd.deploy.chaos.street import LAYER, ChaosStreet, SentReport, read_street
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusClosed, BusError
+from gnd.fleet_bus.links import LinkProfile
 from gnd.fleet_bus.requesting import RetryPolicy
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile import Tile, content_sha
@@ -43,13 +44,49 @@ _QUICK: Final = RetryPolicy(longest_wait_s=0.2, attempt_timeout_s=2.0)
 
 @dataclass(frozen=True, slots=True)
 class ChaosVehicleTask:
-    """A vehicle: where its router is, its name, folder, the seed of its reports, and how often it has one."""
+    """A vehicle.
 
-    connect: str
+    Attributes:
+        connect: endpoints of its routers.
+        name: of the vehicle.
+        folder: of its outboxes.
+        seed: of its reports.
+        every_s: how often it has one, on average, s.
+        link: profile of its link.
+        times: a line for each acknowledgement: when it came, s of the machine's monotonic clock; None: nowhere.
+    """
+
+    connect: tuple[str, ...]
     name: str
     folder: Path
     seed: int
     every_s: float
+    link: str | LinkProfile = "none"
+    times: Path | None = None
+
+
+class _TimedOutbox(Outbox):
+    """An outbox that notes when its reports are acknowledged."""
+
+    def __init__(self, path: Path, times: Path | None) -> None:
+        super().__init__(path)
+        self._times = times
+
+    def answered(
+        self,
+        report_id: str,
+        status: str,
+        reason: str = "",
+        now_ns: int = 0,
+        wanted: bytes = b"",
+        *,
+        is_short: bool = False,
+    ) -> None:
+        """As `Outbox.answered`."""
+        super().answered(report_id, status, reason, now_ns, wanted, is_short=is_short)
+        if self._times is not None and status != "quarantined":
+            with self._times.open("a", encoding="utf-8") as file:
+                file.write(f"{time.monotonic():.4f}\n")
 
 
 class _Trips:
@@ -68,7 +105,7 @@ class _Trips:
         return f"{self._task.name}-{self._trip:03}"
 
     def _begin(self, pseudonym: str) -> Outbox:
-        outbox = Outbox(self._task.folder / f"{pseudonym}.sqlite")
+        outbox = _TimedOutbox(self._task.folder / f"{pseudonym}.sqlite", self._task.times)
         self._open[pseudonym] = outbox, SenderThread(self._bus, outbox, pseudonym)
         return outbox
 
@@ -110,9 +147,11 @@ def vehicle(task: ChaosVehicleTask, *, stop: threading.Event) -> None:
     """Send reports until the run ends them, then continue until all are released."""
     street = read_street()
     rng = random.Random(time.time_ns())
-    with open_bus(BusConfig(connect=(task.connect,), patient=True), name=task.name) as bus:
+    config = BusConfig(connect=task.connect, link=task.link, patient=True)
+    look_s = min(_LOOK_S, task.every_s / 4)
+    with open_bus(config, name=task.name) as bus:
         trips, next_s = _Trips(task, street, bus), time.monotonic()
-        while not stop.wait(_LOOK_S):
+        while not stop.wait(look_s):
             is_enough = (task.folder / ENOUGH).exists()
             try:
                 if not is_enough and time.monotonic() >= next_s:

@@ -180,7 +180,7 @@ def _client_processes(cloud: ChaosCloud, seed: int) -> list[ProcessSpec]:
     specs = []
     for n in range(VEHICLES):
         name = f"vehicle-{n}"
-        task = clients.ChaosVehicleTask(cloud.wires.open(name), name, cloud.vehicles, seed, REPORT_EVERY_S)
+        task = clients.ChaosVehicleTask((cloud.wires.open(name),), name, cloud.vehicles, seed, REPORT_EVERY_S)
         specs.append(ProcessSpec(name, clients.vehicle, (task,)))
     for n in range(FOLLOWERS):
         name = f"follower-{n}"

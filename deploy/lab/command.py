@@ -8,12 +8,14 @@ from typing import Any
 import click
 from rich.console import Console
 
+from gnd.deploy.errors import LabError
 from gnd.deploy.fleet_cli import by_part, run, run_options, summary_text
 from gnd.deploy.fleet_config import load_fleet_config
 from gnd.deploy.interruption import end_on_sigterm
 from gnd.deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
 from gnd.deploy.lab.check import as_json as check_as_json
 from gnd.deploy.lab.groups import DEFAULT_GROUPS, parse_groups
+from gnd.deploy.lab.hosts.command import hosts
 from gnd.deploy.lab.lab import clean as clean_up
 from gnd.deploy.lab.lab import open_lab
 from gnd.deploy.lab.run import LabRun
@@ -29,6 +31,8 @@ WIDTH = 170
 
 
 @click.group(invoke_without_command=True)
+@click.option("--regions", type=int, help="With --hosts: as `gnd lab hosts`, which has further options.")
+@click.option("--hosts", "host_count", type=int, help="With --regions: as `gnd lab hosts`.")
 @click.option(
     "--groups", default=DEFAULT_GROUPS, show_default=True, help="Vehicles by link: profile (or TOML file):number, ..."
 )
@@ -39,6 +43,8 @@ WIDTH = 170
 def lab(
     context: click.Context,
     /,
+    regions: int | None,
+    host_count: int | None,
     groups: str,
     name: str,
     relay_all: bool,
@@ -62,6 +68,9 @@ def lab(
     """
     if context.invoked_subcommand is not None:
         return
+    if regions is not None or host_count is not None:
+        _as_hosts(context, regions, host_count, {"out": out, "as_json": as_json})
+        return
     parsed = parse_groups(groups)
     counts = {"agents": sum(group.count for group in parsed), "link": groups}
     config = load_fleet_config(config_file, by_part(options) | counts, changes)
@@ -84,6 +93,26 @@ def lab(
     click.echo(summary_text(summary, folder))
     Console(width=WIDTH).print(run_table(lab_run.report))
     click.echo(run_verdict(lab_run.report))
+
+
+def _as_hosts(context: click.Context, regions: int | None, count: int | None, also: dict[str, Any]) -> None:
+    """Run `gnd lab hosts` instead; a fleet's options do not go with it.
+
+    Raises:
+        LabError: one was given.
+    """
+    allowed = {"regions", "host_count", "name", *also}
+    command_line = click.core.ParameterSource.COMMANDLINE
+    other = [key for key in context.params if context.get_parameter_source(key) is command_line and key not in allowed]
+    if other:
+        raise LabError(f"--{other[0].replace('_', '-')} does not go with --regions and --hosts: see `gnd lab hosts`")
+    told = {"regions": regions, "count": count} | also
+    if context.get_parameter_source("name") is command_line:
+        told["name"] = context.params["name"]
+    context.invoke(hosts, **{key: value for key, value in told.items() if value is not None})
+
+
+lab.add_command(hosts)
 
 
 @lab.command()

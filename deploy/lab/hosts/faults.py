@@ -1,0 +1,168 @@
+"""The faults between and of hosts, and how each is begun and ended."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.hosts.cloud import links_of_region, state_of_witness
+from gnd.deploy.lab.hosts.network import LabEnd, lose_between
+from gnd.deploy.lab.hosts.plan import DATABASES, WITNESS, LabHost
+from gnd.deploy.lab.hosts.running import HostsCloud
+from gnd.deploy.lab.namespaces import pids_in, run_all
+
+Way = Literal["process", "host", "silent", "partition", "one-way"]
+GONE_WITHIN_S: Final = 5.0
+_LOOK_S: Final = 0.01
+
+End = Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True)
+class HostFault:
+    """A way to hurt the laboratory.
+
+    Attributes:
+        name: as the command and the report name it.
+        way: a process is killed; all processes of a host; or the host falls silent, as one without power. Or a region
+            is cut off from all others, or what it sends is lost and what it is sent arrives.
+        part: whose process or host it is; "primary", "standby": whoever is it then. Of the last region; "" none.
+    """
+
+    name: str
+    way: Way
+    part: str = ""
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether a region cannot be served while it lasts."""
+        return self.way in ("partition", "one-way")
+
+
+FAULTS: Final = (
+    HostFault("router", "process", "router"),
+    HostFault("tiles", "process", "tiles"),
+    HostFault("shard", "process", "shard"),
+    HostFault("database", "process", "primary"),
+    HostFault("router-host", "host", "router"),
+    HostFault("tiles-host", "host", "tiles"),
+    HostFault("shard-host", "host", "shard"),
+    HostFault("database-host", "host", "primary"),
+    HostFault("standby-host", "host", "standby"),
+    HostFault("silent-shard-host", "silent", "shard"),
+    HostFault("silent-database-host", "silent", "primary"),
+    HostFault("partition", "partition"),
+    HostFault("one-way", "one-way"),
+)
+BY_FAULT: Final = {fault.name: fault for fault in FAULTS}
+DEFAULT_FAULTS: Final = "router-host,tiles-host,shard-host,database-host,partition"
+
+
+def parse_faults(text: str) -> tuple[HostFault, ...]:
+    """Read names with commas; "all" are all.
+
+    Raises:
+        LabError: no name, or one that is not known.
+    """
+    names = [word.strip() for word in text.split(",") if word.strip()]
+    if names == ["all"]:
+        return FAULTS
+    unknown = [name for name in names if name not in BY_FAULT]
+    if unknown or not names:
+        raise LabError(f"no fault {', '.join(unknown) or text!r}; there are: all, {', '.join(BY_FAULT)}")
+    return tuple(BY_FAULT[name] for name in names)
+
+
+def check_faults(faults: Iterable[HostFault], *, regions: int, has_witness: bool) -> None:
+    """Refuse what this laboratory cannot survive by its plan.
+
+    Raises:
+        LabError: no witness for a database that is lost, or no second region.
+    """
+    for fault in faults:
+        if fault.part in ("primary", "standby") and not has_witness:
+            raise LabError(f"fault {fault.name}: the loss of a database host needs a third host, which decides")
+        if regions < 2 and fault.part not in ("primary", "standby"):
+            raise LabError(f"fault {fault.name}: needs 2 regions, so that there is another one")
+
+
+def begin_fault(cloud: HostsCloud, fault: HostFault) -> tuple[str, End]:
+    """Do it.
+
+    Returns:
+        What was hit, in words, and how to end it.
+    """
+    if fault.is_cut:
+        return _cut(cloud, both=fault.way == "partition")
+    part = _part(cloud, fault.part)
+    host = cloud.plan.host_of(part)
+    if fault.way == "process":
+        cloud.lose((part,))
+        return f"{part} on {host.name}", lambda: cloud.give_back((part,))
+    undo = _silence(cloud, host) if fault.way == "silent" else ()
+    cloud.lose(host.parts)
+    kill_all(host)
+
+    def end() -> None:
+        run_all(undo)
+        cloud.give_back(host.parts)
+
+    return f"{host.name}: {', '.join(host.parts)}", end
+
+
+def _part(cloud: HostsCloud, part: str) -> str:
+    if part not in ("primary", "standby"):
+        return f"{part}-{cloud.plan.size.regions - 1}"
+    state = state_of_witness(cloud.folders) or {"primary": DATABASES[0]}
+    primary = str(state["primary"])
+    return primary if part == "primary" else DATABASES[1 - DATABASES.index(primary)]
+
+
+def _cut(cloud: HostsCloud, *, both: bool) -> tuple[str, End]:
+    """The last region, its vehicles with it, from all other hosts."""
+    region = cloud.plan.size.regions - 1
+    own = [host for host in cloud.plan.hosts if host.region == region]
+    others = [LabEnd.of_host(host) for host in cloud.plan.hosts if host.region != region]
+    inside = [LabEnd.of_host(host) for host in own]
+    inside += [LabEnd.of_link(link) for link in links_of_region(cloud.plan, cloud.lab, region)]
+    undo = lose_between(cloud.lab.cloud_namespace, inside, others)
+    if both:
+        undo += lose_between(cloud.lab.cloud_namespace, others, inside)
+    return f"region {region}: {', '.join(host.name for host in own)}", lambda: run_all(undo)
+
+
+def _silence(cloud: HostsCloud, host: LabHost) -> Sequence[tuple[str, ...]]:
+    """Nothing comes from a host any more, and nothing that is sent there is answered."""
+    own = LabEnd.of_host(host)
+    everybody = [LabEnd.of_host(one) for one in cloud.plan.hosts if one != host]
+    everybody += [LabEnd.of_link(link) for link in cloud.lab.links]
+    middle = cloud.lab.cloud_namespace
+    return lose_between(middle, [own], everybody) + lose_between(middle, everybody, [own])
+
+
+def kill_all(host: LabHost) -> None:
+    """End every process of a host by SIGKILL, those too that are started meanwhile.
+
+    Raises:
+        LabError: some do not go.
+    """
+    deadline_s = time.monotonic() + GONE_WITHIN_S
+    while pids := pids_in(host.namespace):
+        if time.monotonic() > deadline_s:
+            raise LabError(f"{len(pids)} processes of {host.name} do not end")
+        for pid in pids:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(_LOOK_S)
+
+
+def is_back(cloud: HostsCloud) -> bool:
+    """Whether the database has two sides again, so that the next fault finds what it needs."""
+    state = state_of_witness(cloud.folders)
+    return WITNESS not in {part for host in cloud.plan.hosts for part in host.parts} or (
+        state is not None and not state["is_alone"]
+    )

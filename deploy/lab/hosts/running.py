@@ -1,0 +1,182 @@
+"""The laboratory while it runs: who starts again what dies, and leaves alone what is lost."""
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import Final
+
+import psycopg
+
+from gnd.deploy.chaos.street import LAYER, ChaosStreet
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.hosts.cloud import (
+    LabFolders,
+    client_processes,
+    cloud_processes,
+    database_processes,
+    state_of_witness,
+)
+from gnd.deploy.lab.hosts.plan import DATABASE_PORT, DATABASES, HostsPlan
+from gnd.deploy.lab.hosts.postgres import DATABASE, OWNER
+from gnd.deploy.lab.lab import Lab
+from gnd.deploy.lab.run import relay_processes
+from gnd.deploy.processes import ProcessSpec, Supervisor
+from gnd.deploy.repeating import repeated
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import PLAIN_VARIABLE, BusConfig
+from gnd.gnd_map.errors import GndError
+from gnd.schemas.keys import tile_key
+from gnd.tile_store.location import open_store
+
+READY_S: Final = 120.0
+POLL_S: Final = 0.1
+_LOOK_S: Final = 0.1
+_LOG: Final = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class HostsCloud:
+    """A running laboratory.
+
+    Attributes:
+        plan: which part is on which host.
+        lab: namespaces and links.
+        folders: where it writes.
+        supervisor: starts again what dies.
+        died: why the supervisor has given up, if it has.
+    """
+
+    plan: HostsPlan
+    lab: Lab
+    folders: LabFolders
+    supervisor: Supervisor
+    died: list[str] = field(default_factory=list)
+    _specs: dict[str, ProcessSpec] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def start(self, specs: Iterable[ProcessSpec]) -> None:
+        """Start parts; they are started again when they die."""
+        with self._lock:
+            for spec in specs:
+                self._specs[spec.name] = spec
+                self.supervisor.start(spec)
+
+    def lose(self, parts: Iterable[str]) -> None:
+        """Kill parts; they stay away."""
+        with self._lock:
+            names = tuple(part for part in parts if part in self.supervisor.pids())
+            for name in names:
+                self.supervisor.kill(name)
+            if names:
+                self.supervisor.stop(names)
+
+    def give_back(self, parts: Iterable[str]) -> None:
+        """Start parts again that were lost."""
+        with self._lock:
+            for part in parts:
+                if part not in self.supervisor.pids():
+                    self.supervisor.start(self._specs[part])
+
+    def stop(self, parts: Iterable[str]) -> None:
+        """End parts in order."""
+        with self._lock:
+            self.supervisor.stop(tuple(parts))
+
+    def poll(self) -> None:
+        """Start again what has died."""
+        with self._lock:
+            try:
+                self.supervisor.poll()
+            except GndError as error:
+                if str(error) not in self.died:
+                    self.died.append(str(error))
+
+
+@contextmanager
+def running_hosts(
+    plan: HostsPlan, lab: Lab, folders: LabFolders, street: ChaosStreet, clients: tuple[int, float]
+) -> Iterator[HostsCloud]:
+    """Start database, routers, tile servers, shards and clients, end all with the block.
+
+    The calling thread must be in the middle's namespace.
+
+    Args:
+        plan: which part is on which host.
+        lab: its namespaces and links are there.
+        folders: made.
+        street: the map that is published first.
+        clients: seed of the reports, and how often a vehicle has one, s.
+
+    Raises:
+        LabError: the database does not become ready.
+        BusError: no tile server answers.
+    """
+    with ExitStack() as stack:
+        stack.enter_context(_plain())
+        supervisor = Supervisor(folders.logs, folders.root / "pids.json")
+        stack.callback(supervisor.stop)
+        cloud = HostsCloud(plan, lab, folders, supervisor)
+        cloud.start(relay_processes(lab, folders.relays))
+        cloud.start(database_processes(plan, folders))
+        _make_database(plan)
+        with open_store(plan.database_url) as store:
+            store.put_tiles(street.tiles)
+        _until(lambda: _has_standby(cloud), "the standby follows")
+        cloud.start(cloud_processes(plan))
+        with open_bus(BusConfig(connect=(plan.hub,), open_timeout_s=READY_S), name="probe") as bus:
+            bus.request(tile_key(LAYER, street.tiles[0].tile_id), b"", kind="tile", timeout_s=READY_S)
+        cloud.start(client_processes(plan, lab, folders, *clients))
+        stack.enter_context(repeated(lambda _n: cloud.poll(), POLL_S, "supervisor"))
+        yield cloud
+
+
+@contextmanager
+def _plain() -> Iterator[None]:
+    """This process may talk to the hosts without TLS, as theirs do: a lab's namespaces reach nobody else."""
+    before = os.environ.get(PLAIN_VARIABLE)
+    os.environ[PLAIN_VARIABLE] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop(PLAIN_VARIABLE)
+        if before is not None:
+            os.environ[PLAIN_VARIABLE] = before
+
+
+def _make_database(plan: HostsPlan) -> None:
+    address = plan.host_of(DATABASES[0]).address
+
+    def made() -> bool:
+        try:
+            with psycopg.connect(
+                host=address, port=DATABASE_PORT, user=OWNER, dbname="postgres", connect_timeout=2, autocommit=True
+            ) as owner:
+                owner.execute(f"CREATE DATABASE {DATABASE}")
+        except psycopg.errors.DuplicateDatabase:
+            return True
+        except psycopg.Error:
+            return False
+        return True
+
+    _until(made, "the database answers")
+
+
+def _has_standby(cloud: HostsCloud) -> bool:
+    if cloud.plan.has_witness:
+        state = state_of_witness(cloud.folders)
+        return state is not None and not state["is_alone"]
+    with psycopg.connect(cloud.plan.database_url) as connection:
+        row = connection.execute("SELECT count(*) FROM pg_stat_replication WHERE sync_state = 'sync'").fetchone()
+    return row is not None and bool(row[0])
+
+
+def _until(condition: Callable[[], bool], what: str) -> None:
+    deadline_s = time.monotonic() + READY_S
+    while not condition():
+        if time.monotonic() > deadline_s:
+            raise LabError(f"not within {READY_S:g} s: {what}")
+        time.sleep(_LOOK_S)
