@@ -62,6 +62,7 @@ def database(side: DatabaseSide, *, stop: threading.Event) -> None:
         LabError: the server has ended, or the other one has taken over: begun again, this side is its copy.
     """
     client = WitnessClient(side.witness, side.name)
+    LabServer(side.name, side.address, side.folder).end_left()
     state = _remembered(client, stop)
     watch: _Primary | _Standby = _Primary(side, client) if state.primary == side.name else _Standby(side, client)
     try:
@@ -93,6 +94,7 @@ class _Side:
         self._seen_s = time.monotonic()
 
     def _start(self, stop: threading.Event) -> bool:
+        """Start the server and wait until it answers; False: it does not, or was stopped meanwhile."""
         self._process = self._server.start()
         until_s = time.monotonic() + READY_S
         while time.monotonic() < until_s and not stop.is_set():
@@ -224,7 +226,7 @@ class _Standby(_Side):
             return self
         _LOG.warning("%s takes over", self._side.name)
         self._server.configure()
-        if not self._asked("SELECT pg_promote(true, 30)"):
+        if self._asked("SELECT pg_promote(true, 30)") != [(True,)]:
             raise LabError(f"{self._side.name} could not take over")
         return _Primary.promoted(self)
 

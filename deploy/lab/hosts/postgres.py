@@ -6,11 +6,13 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
+import psutil
 import psycopg
 
 from gnd.deploy.errors import LabError
@@ -130,6 +132,17 @@ class LabServer:
         return subprocess.Popen(  # noqa: S603  (words of our own; of its own session: Ctrl-C is not for it)
             [server_programs() / "postgres", "-D", self.data], stdout=sys.stderr, start_new_session=True, **_as_user()
         )
+
+    def end_left(self) -> None:
+        """End a server that an earlier life of this host's process has left running on these data."""
+        file = self.data / "postmaster.pid"
+        if not file.exists():
+            return
+        with suppress(psutil.NoSuchProcess, ValueError, IndexError):
+            process = psutil.Process(int(file.read_text(encoding="utf-8").split()[0]))
+            if process.name() == "postgres":
+                process.send_signal(signal.SIGQUIT)
+                process.wait(_TIMEOUT_S)
 
     def connect(self, database: str = "postgres") -> psycopg.Connection[Any]:
         """A connection of the owner to the server on this host."""

@@ -23,7 +23,7 @@ from gnd.tile_store.errors import StoreError
 from gnd.tile_store.location import open_store
 from gnd.tile_store.sqlite_store import SqlStore
 
-READY_S: Final = 120.0
+READY_S: Final = 300.0
 BACK_S: Final = 90.0
 """After a fault all regions must be served again within so long."""
 CALM_S: Final = 5.0

@@ -5,10 +5,11 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Final
 
+import psutil
 import psycopg
 
 from gnd.deploy.chaos.street import LAYER, ChaosStreet
@@ -32,7 +33,7 @@ from gnd.gnd_map.errors import GndError
 from gnd.schemas.keys import tile_key
 from gnd.tile_store.location import open_store
 
-READY_S: Final = 120.0
+READY_S: Final = 300.0
 POLL_S: Final = 0.1
 _LOOK_S: Final = 0.1
 _LOG: Final = logging.getLogger(__name__)
@@ -66,11 +67,16 @@ class HostsCloud:
                 self.supervisor.start(spec)
 
     def lose(self, parts: Iterable[str]) -> None:
-        """Kill parts; they stay away."""
+        """Kill parts with all that they have started; they stay away."""
         with self._lock:
-            names = tuple(part for part in parts if part in self.supervisor.pids())
+            pids = self.supervisor.pids()
+            names = tuple(part for part in parts if part in pids)
             for name in names:
+                children = _children(pids[name])
                 self.supervisor.kill(name)
+                for child in children:
+                    with suppress(psutil.NoSuchProcess):
+                        child.kill()
             if names:
                 self.supervisor.stop(names)
 
@@ -94,6 +100,13 @@ class HostsCloud:
             except GndError as error:
                 if str(error) not in self.died:
                     self.died.append(str(error))
+
+
+def _children(pid: int) -> list[psutil.Process]:
+    try:
+        return psutil.Process(pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
 
 
 @contextmanager
