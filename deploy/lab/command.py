@@ -141,6 +141,12 @@ def clean() -> None:
     check_rights()
     done = clean_up()
     for name, removed in done.items():
-        click.echo(f"{name}: {len(removed)} namespaces removed" if removed else f"{name} runs: left alone")
+        click.echo(f"{name}: {_removed_text(removed)}" if removed else f"{name} runs: left alone")
     if not done:
         click.echo("nothing to remove")
+
+
+def _removed_text(removed: tuple[str, ...]) -> str:
+    folders = [one for one in removed if one.startswith("/")]
+    count = len(removed) - len(folders)
+    return " and ".join([f"{count} namespaces", *folders]) + " removed"

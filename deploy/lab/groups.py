@@ -113,9 +113,14 @@ def _unused(profile: str, groups: list[Group]) -> str:
     return next(name for name in (clean, *(f"{clean}-{n}" for n in range(2, MAX_AGENTS + 2))) if name not in taken)
 
 
+def is_lab_name(name: str) -> bool:
+    """Whether a lab can have this name."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_lab_name(name: str) -> str:
     """Return the name of a lab, or raise `LabError` where it cannot be part of a namespace's name."""
-    if not _NAME.fullmatch(name):
+    if not is_lab_name(name):
         raise LabError(f"a lab's name is 1 to 20 of a-z, 0-9 and -, beginning with a letter or digit; got {name!r}")
     return name
 

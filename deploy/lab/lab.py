@@ -20,6 +20,7 @@ import psutil
 from gnd.deploy.errors import LabError, LabRuns
 from gnd.deploy.lab.devices import link_commands
 from gnd.deploy.lab.groups import PREFIX, Group, LabLink, check_lab_name, links_of, namespace_name
+from gnd.deploy.lab.hosts.data import labs_with_data, remove_data
 from gnd.deploy.lab.namespaces import add_namespace, namespaces, pids_in, remove_namespace, run_all
 from gnd.deploy.lab.tools import Offer, check_offer, kernel_offer, needs_carrying
 
@@ -189,13 +190,13 @@ def clean() -> dict[str, tuple[str, ...]]:
     """Remove what killed labs have left behind; labs that run are left alone.
 
     Returns:
-        The removed namespaces by lab; an empty tuple for a lab that runs.
+        The removed namespaces, and the folder of databases, by lab; an empty tuple for a lab that runs.
     """
     done: dict[str, tuple[str, ...]] = {}
-    for name in labs():
+    for name in sorted({*labs(), *labs_with_data()}):
         try:
             with lab_lock(name):
-                done[name] = remove_all(name)
+                done[name] = (*remove_all(name), *remove_data(name))
         except LabRuns:
             done[name] = ()
     return done

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 ACCOUNT: Final = "lab_hosts.json"
 WIDTH: Final = 150
 SIZE: Final = HostsSize()
-DEFAULT_FAULTS: Final = "router-host,tiles-host,shard-host,database-host,partition"
 
 
 @click.command()
@@ -34,7 +33,7 @@ DEFAULT_FAULTS: Final = "router-host,tiles-host,shard-host,database-host,partiti
 @click.option("--hosts", "count", type=int, default=SIZE.hosts, show_default=True, help="Machines, 2 or more.")
 @click.option("--vehicles", type=int, default=SIZE.vehicles, show_default=True, help="Of each region.")
 @click.option("--link", default="5g", show_default=True, help="Link of each vehicle: a profile or a TOML file.")
-@click.option("--faults", default=DEFAULT_FAULTS, show_default=True, help="With commas, in order; all: each one.")
+@click.option("--faults", help="With commas, in order; all: each one.  [default: the loss of hosts, and a partition]")
 @click.option("--times", type=click.IntRange(1, 100), default=1, show_default=True, help="How often the list is done.")
 @click.option("--away", type=float, default=10.0, show_default=True, help="How long what is lost stays away, s.")
 @click.option("--cut", type=float, default=60.0, show_default=True, help="How long a region is cut off, s.")
@@ -42,9 +41,11 @@ DEFAULT_FAULTS: Final = "router-host,tiles-host,shard-host,database-host,partiti
 @click.option("--gap", type=float, default=5.0, show_default=True, help="Allowed time without service, s.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Draws the reports.")
 @click.option("--name", default="hosts", show_default=True, help="Name of the lab; only one lab of a name can run.")
-@click.option("--out", type=click.Path(path_type=Path), help="Empty or new: outboxes, logs, lab_hosts.json.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="For outboxes, logs, lab_hosts.json.  [default: a new one]"
+)
 @click.option("--json", "as_json", is_flag=True, help="Print lab_hosts.json instead of tables.")
-def hosts(regions: int, count: int, vehicles: int, link: str, faults: str, times: int, **options: Any) -> None:
+def hosts(regions: int, count: int, vehicles: int, link: str, faults: str | None, times: int, **options: Any) -> None:
     """Run a cloud of several hosts and regions in network namespaces, inflict faults, and check what is left.
 
     The exit code is 1 if an acknowledged report was lost or is there twice, if the map differs from its journal, or if
@@ -53,11 +54,10 @@ def hosts(regions: int, count: int, vehicles: int, link: str, faults: str, times
     """
     plan, profile = plan_hosts(options["name"], HostsSize(regions, count, vehicles)), load_link(link)
     need_all()
-    from gnd.deploy.lab.hosts.faults import check_faults, parse_faults
+    from gnd.deploy.lab.hosts.faults import chosen_faults
     from gnd.deploy.lab.hosts.run import HostsOptions
 
-    chosen = parse_faults(faults) * times
-    check_faults(chosen, regions=regions, has_witness=plan.has_witness)
+    chosen = chosen_faults(faults, plan) * times
     run_options = HostsOptions(
         chosen, options["seed"], options["every"], options["away"], options["cut"], options["gap"]
     )

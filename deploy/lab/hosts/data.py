@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from gnd.deploy.lab.groups import PREFIX
+from gnd.deploy.lab.groups import PREFIX, is_lab_name
 
 DATA_ROOT: Final = Path("/var/tmp") / PREFIX  # noqa: S108  (the labs' own folder; names are locked)
 
@@ -23,15 +23,20 @@ def data_folder(lab: str) -> Iterator[Path]:
         remove_data(lab)
 
 
-def remove_data(lab: str) -> bool:
-    """Remove what a lab's databases have left; whether there was anything. Call it under the lab's lock."""
+def remove_data(lab: str) -> tuple[str, ...]:
+    """Remove what a lab's databases have left; call it under the lab's lock.
+
+    Returns:
+        The removed folder; nothing where there was none.
+    """
     folder = DATA_ROOT / lab
-    was_there = folder.is_dir() and not folder.is_symlink()
-    if was_there:
-        shutil.rmtree(folder)
-    return was_there
+    if not folder.is_dir() or folder.is_symlink():
+        return ()
+    shutil.rmtree(folder)
+    return (str(folder),)
 
 
 def labs_with_data() -> tuple[str, ...]:
     """Names of labs whose databases lie there."""
-    return tuple(sorted(path.name for path in DATA_ROOT.iterdir())) if DATA_ROOT.is_dir() else ()
+    found = sorted(path.name for path in DATA_ROOT.iterdir()) if DATA_ROOT.is_dir() else ()
+    return tuple(name for name in found if is_lab_name(name))

@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -11,7 +11,7 @@ from typing import Final, Literal
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.hosts.cloud import links_of_region, state_of_witness
 from gnd.deploy.lab.hosts.network import LabEnd, lose_between
-from gnd.deploy.lab.hosts.plan import DATABASES, WITNESS, LabHost
+from gnd.deploy.lab.hosts.plan import DATABASES, HostsPlan, LabHost
 from gnd.deploy.lab.hosts.running import HostsCloud
 from gnd.deploy.lab.namespaces import pids_in, run_all
 
@@ -73,21 +73,39 @@ def parse_faults(text: str) -> tuple[HostFault, ...]:
         return FAULTS
     unknown = [name for name in names if name not in BY_FAULT]
     if unknown or not names:
-        raise LabError(f"no fault {', '.join(unknown) or text!r}; there are: all, {', '.join(BY_FAULT)}")
+        raise LabError(f"no fault {', '.join(unknown) or repr(text)}; there are: all, {', '.join(BY_FAULT)}")
     return tuple(BY_FAULT[name] for name in names)
 
 
-def check_faults(faults: Iterable[HostFault], *, regions: int, has_witness: bool) -> None:
-    """Refuse what this laboratory cannot survive by its plan.
+def chosen_faults(text: str | None, plan: HostsPlan) -> tuple[HostFault, ...]:
+    """The faults of a run: those that are named, else the usual ones that this laboratory can survive.
 
     Raises:
-        LabError: no witness for a database that is lost, or no second region.
+        LabError: one is not known, or this laboratory cannot survive it by its plan.
     """
+    if text is None:
+        return tuple(fault for fault in parse_faults(DEFAULT_FAULTS) if not why_not_survived(fault, plan))
+    faults = parse_faults(text)
     for fault in faults:
-        if fault.part in ("primary", "standby") and not has_witness:
-            raise LabError(f"fault {fault.name}: the loss of a database host needs a third host, which decides")
-        if regions < 2 and fault.part not in ("primary", "standby"):
-            raise LabError(f"fault {fault.name}: needs 2 regions, so that there is another one")
+        if why := why_not_survived(fault, plan):
+            raise LabError(f"fault {fault.name}: {why}")
+    return faults
+
+
+def why_not_survived(fault: HostFault, plan: HostsPlan) -> str:
+    """What this laboratory lacks; empty: nothing."""
+    is_database = fault.part in ("primary", "standby")
+    if is_database and not plan.has_witness:
+        return "the loss of a database host needs a third host, which decides who goes on"
+    if not is_database and plan.size.regions < 2:
+        return "needs 2 regions, so that the other one goes on"
+    if fault.way in ("host", "silent") and not plan.has_witness and set(DATABASES) & _parts_of_host(fault, plan):
+        return "its host has a database, and there is no third host, which decides who goes on"
+    return ""
+
+
+def _parts_of_host(fault: HostFault, plan: HostsPlan) -> set[str]:
+    return set(plan.host_of(f"{fault.part}-{plan.size.regions - 1}").parts)
 
 
 def begin_fault(cloud: HostsCloud, fault: HostFault) -> tuple[str, End]:
@@ -163,6 +181,4 @@ def kill_all(host: LabHost) -> None:
 def is_back(cloud: HostsCloud) -> bool:
     """Whether the database has two sides again, so that the next fault finds what it needs."""
     state = state_of_witness(cloud.folders)
-    return WITNESS not in {part for host in cloud.plan.hosts for part in host.parts} or (
-        state is not None and not state["is_alone"]
-    )
+    return not cloud.plan.has_witness or (state is not None and not state["is_alone"])

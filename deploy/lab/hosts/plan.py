@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gnd.deploy.errors import LabError
-from gnd.deploy.lab.groups import namespace_name
+from gnd.deploy.lab.groups import check_lab_name, namespace_name
 
 MOST_HOSTS: Final = 32
 MOST_VEHICLES: Final = 50
@@ -144,7 +144,11 @@ def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:
     Args:
         lab: name of the laboratory.
         size: of it.
+
+    Raises:
+        LabError: no lab can have this name.
     """
+    check_lab_name(lab)
     regions = [number * size.regions // size.hosts for number in range(size.hosts)]
     placed: list[tuple[str, int]] = [(DATABASES[0], 0), (DATABASES[1], 1)]
     for region in range(size.regions):

@@ -1,0 +1,216 @@
+"""The laboratory of hosts as a plan: where parts run, what is refused, who may take writes, how gaps are counted."""
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from lab_testing import finished, gnd_lab
+from suite_ports import new_port
+
+from gnd.deploy.chaos.checks import Findings
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.groups import DEFAULT_GROUPS
+from gnd.deploy.lab.hosts import data
+from gnd.deploy.lab.hosts.cloud import read_times
+from gnd.deploy.lab.hosts.faults import FAULTS, chosen_faults, parse_faults
+from gnd.deploy.lab.hosts.plan import DATABASES, OF_REGION, HostsSize, plan_hosts
+from gnd.deploy.lab.hosts.run import HostsOptions
+from gnd.deploy.lab.hosts.verdict import HostsOutcome, HostTrial, longest_gap_s
+from gnd.deploy.lab.hosts.witness import WitnessClient, WitnessState, witness
+
+
+@pytest.mark.parametrize("size", [(r, h) for h in range(2, 9) for r in range(1, h + 1)])
+def test_every_part_has_one_host_and_sides_that_stand_in_for_each_other_have_two(size: tuple[int, int]) -> None:
+    regions, hosts = size
+    plan = plan_hosts("t", HostsSize(regions, hosts))
+    parts = [part for host in plan.hosts for part in host.parts]
+    of_regions = {f"{part}-{region}" for part in OF_REGION for region in range(regions)}
+    assert sorted(parts) == sorted({*DATABASES, "hub", *of_regions, *(["witness"] if hosts > 2 else [])})
+    assert plan.host_of(DATABASES[0]) != plan.host_of(DATABASES[1])
+    assert {host.region for host in plan.hosts} == set(range(regions))
+    assert all(plan.host_of(f"{part}-{r}").region == r for part in OF_REGION for r in range(regions))
+    if hosts > 2:
+        assert not set(DATABASES) & set(plan.host_of("witness").parts)
+    assert len({host.address for host in plan.hosts}) == hosts
+
+
+def test_with_room_nothing_shares_a_host_with_the_database() -> None:
+    plan = plan_hosts("t", HostsSize(regions=2, hosts=12))
+    assert [plan.host_of(part).parts for part in DATABASES] == [("database-a",), ("database-b",)]
+    assert max(len(host.parts) for host in plan.hosts) == 1
+
+
+def test_a_store_is_looked_for_at_both_hosts_and_written_where_it_can_be() -> None:
+    url = plan_hosts("t", HostsSize(2, 4)).database_url
+    assert url.startswith("postgresql://gnd@198.19.0.2:5432,198.19.1.2:5432/gnd?target_session_attrs=read-write")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("hosts", "--hosts", "1"), "1 hosts: a database and its standby need 2"),
+        (("hosts", "--hosts", "33"), "32 is the most"),
+        (("--regions", "3", "--hosts", "2"), "3 regions on 2 hosts"),
+        (("--regions", "0", "--hosts", "2"), "0 regions on 2 hosts"),
+        (("--hosts", "1"), "1 hosts: a database and its standby need 2"),
+        (("--regions", "2", "--hosts", "4", "--groups", DEFAULT_GROUPS), "--groups does not go with --regions"),
+        (("hosts", "--vehicles", "0"), "0 vehicles a region"),
+        (("hosts", "--faults", "earthquake,router"), "no fault earthquake; there are: all, router, tiles"),
+        (("hosts", "--faults", ","), "no fault ','"),
+        (("hosts", "--hosts", "2", "--faults", "database-host"), "needs a third host, which decides"),
+        (("hosts", "--regions", "1", "--faults", "partition"), "needs 2 regions"),
+        (("hosts", "--cut", "nan"), "partition_s must be 0.05 to 3600, got nan"),
+        (("hosts", "--link", "6g"), "no link profile '6g'"),
+        (("hosts", "--name", "../x"), "a lab's name is 1 to 20 of a-z"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_is_made(arguments: tuple[str, ...], words: str) -> None:
+    code, out, err = finished(gnd_lab(*arguments))
+    assert (code, out) == (2, "")
+    assert err.startswith("gnd: ")
+    assert words in err
+
+
+def test_the_folder_of_a_run_must_be_empty(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, _, err = finished(gnd_lab("hosts", "--out", str(tmp_path)))
+    assert code == 2
+    assert "root" in err or "exists and is not empty" in err
+
+
+def test_faults_are_read_by_name() -> None:
+    assert parse_faults("all") == FAULTS
+    assert [fault.name for fault in parse_faults(" partition, router,")] == ["partition", "router"]
+    assert chosen_faults("all", plan_hosts("t", HostsSize(2, 4))) == FAULTS
+
+
+@pytest.mark.parametrize(
+    ("regions", "hosts", "names"),
+    [
+        (2, 4, ["router-host", "tiles-host", "shard-host", "database-host", "partition"]),
+        (1, 3, ["database-host"]),
+        (2, 2, ["partition"]),
+        (1, 2, []),
+    ],
+)
+def test_without_a_choice_it_is_hurt_as_it_can_survive(regions: int, hosts: int, names: list[str]) -> None:
+    assert [fault.name for fault in chosen_faults(None, plan_hosts("t", HostsSize(regions, hosts)))] == names
+
+
+def test_options_are_checked() -> None:
+    with pytest.raises(LabError, match="every_s must be"):
+        HostsOptions(FAULTS, every_s=0.0)
+
+
+def test_the_witness_never_lets_both_go_on_alone() -> None:
+    """Over all sequences of five questions: from a yes for one side to its pairing the other is told no."""
+    words = [(word, name) for word in ("promote", "alone", "paired") for name in ("a", "b")]
+    todo: list[tuple[WitnessState, int]] = [(WitnessState("a", is_alone=False), 5)]
+    seen = set()
+    while todo:
+        state, left = todo.pop()
+        for word, name in words if left else ():
+            after, granted = state.after(word, name)
+            if name != state.primary:
+                assert granted == (word == "promote" and not state.is_alone)
+            if granted and word != "paired":
+                assert after == WitnessState(name, is_alone=True)
+            if not granted:
+                assert after == state
+            seen.add((state, word, name))
+            todo.append((after, left - 1))
+    assert len(seen) == 4 * len(words), "every state was asked everything"
+    with pytest.raises(LabError, match="not asked 'steal'"):
+        WitnessState("a").after("steal", "a")
+
+
+@contextmanager
+def a_witness(file: Path) -> Iterator[tuple[str, int]]:
+    address, stop = ("127.0.0.1", new_port()), threading.Event()
+    thread = threading.Thread(target=witness, args=(address, file, "a"), kwargs={"stop": stop})
+    thread.start()
+    try:
+        while WitnessClient(address, "x").who() is None:
+            assert thread.is_alive()
+        yield address
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_the_witness_remembers_and_takes_no_nonsense(tmp_path: Path) -> None:
+    file = tmp_path / "witness.json"
+    with a_witness(file) as address:
+        a, b = WitnessClient(address, "a"), WitnessClient(address, "b")
+        assert a.who() == WitnessState("a", is_alone=True)
+        assert (b.grants("promote"), a.grants("paired"), b.grants("promote")) == (False, True, True)
+        assert not a.grants("alone")
+        for nonsense in (b"\xff\x00\n", b"steal a\n", b"x" * 10_000 + b"\n", b""):
+            with socket.create_connection(address, 5) as connection:
+                connection.sendall(nonsense)
+                connection.shutdown(socket.SHUT_WR)
+        assert not a.grants("steal")
+        assert a.who() == WitnessState("b", is_alone=True)
+    with a_witness(file) as address:
+        assert WitnessClient(address, "a").who() == WitnessState("b", is_alone=True), "also over its end"
+    assert json.loads(file.read_text()) == {"primary": "b", "is_alone": True}
+    assert WitnessClient(address, "a").who() is None, "nobody answers there any more"
+    assert not WitnessClient(None, "a").grants("promote")
+
+
+def test_a_gap_is_the_longest_pause_and_lasts_up_to_the_end() -> None:
+    assert longest_gap_s([1.0, 2.0, 5.0, 6.0], 0.0, 7.0) == 3.0
+    assert longest_gap_s([1.0], 0.0, 10.0) == 9.0
+    assert longest_gap_s([], 3.0, 7.0) == 4.0
+    assert longest_gap_s([0.0, 9.0], 4.0, 10.0) == 5.0, "a pause from before counts from the fault"
+
+
+def trial(acks_s: list[list[float]], *, is_cut: bool = False) -> HostTrial:
+    tiles_s = [[10.5, 11.5, 12.5, 13.5, 14.5]] * len(acks_s)
+    return HostTrial("x", "host-1", 10.0, 14.0, 15.0, is_cut, len(acks_s) - 1, acks_s, tiles_s)
+
+
+def test_the_worst_region_counts_and_a_cut_one_from_when_it_is_whole() -> None:
+    served, silent = [10.2, 11.0, 12.0, 13.0, 14.2], [9.0, 14.8]
+    assert trial([served, silent]).ack_gap_s == pytest.approx(4.8)
+    assert trial([served, silent], is_cut=True).ack_gap_s == pytest.approx(1.2), "the other region's"
+    assert trial([silent, served], is_cut=True).ack_gap_s == pytest.approx(4.8), "the cut one does not excuse it"
+    assert trial([served, silent]).acknowledged == 6
+    assert trial([served, silent]).as_dict()["tile_gap_s"] == 1.0
+
+
+def outcome(trials: tuple[HostTrial, ...], findings: Findings, settled_s: float | None = 1.0) -> HostsOutcome:
+    return HostsOutcome({}, {}, 1, None, trials, findings, settled_s, 4.0, False, {}, ())
+
+
+def test_what_was_broken_is_named() -> None:
+    served, silent = [10.2, 11.0, 12.0, 13.0, 14.2], [9.0, 14.8]
+    good = Findings(reports=3, acknowledged=3, versions=1, received=9, identical_map=True)
+    assert outcome((trial([served]),), good).failures == []
+    assert outcome((trial([silent]),), good).failures == ["x (host-1): 4.8 s without service"]
+    assert outcome((), good, None).failures == ["it did not settle"]
+    bad = Findings(acknowledged=3, versions=1, received=9, lost=["one"], doubled=["two"])
+    assert outcome((), bad).failures == ["1 lost", "1 doubled", "gnd map verify: {}"]
+
+
+def test_times_of_clients_that_were_killed_while_they_wrote(tmp_path: Path) -> None:
+    file = tmp_path / "a.times"
+    file.write_text("2.5000\n1.2500\n3")
+    assert read_times([file, tmp_path / "missing"]) == [1.25, 2.5]
+
+
+def test_only_a_labs_folders_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(data, "DATA_ROOT", tmp_path / "labs")
+    assert data.labs_with_data() == ()
+    with data.data_folder("one") as folder:
+        (folder / "file").touch()
+        (tmp_path / "labs" / "Not a lab").mkdir()
+        assert data.labs_with_data() == ("one",)
+    assert not folder.exists()
+    (tmp_path / "labs" / "two").symlink_to(tmp_path)
+    assert data.remove_data("two") == ()
+    assert tmp_path.exists()
