@@ -22,15 +22,19 @@ _OWN: Final = Path("/proc/thread-self/ns/net")
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def run_tool(*words: str) -> str:
+def run_tool(*words: str, lines: str | None = None) -> str:
     """Run `ip`, `tc` or `ss` and return what it prints.
+
+    Args:
+        words: the command.
+        lines: what it reads; None: nothing.
 
     Raises:
         LabError: the tool is missing, fails or hangs; with its own words.
     """
     try:
         done = subprocess.run(  # noqa: S603  (words of our own, no shell)
-            words, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S, check=False
+            words, input=lines, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S, check=False
         )
     except FileNotFoundError as error:
         raise LabError(f"{words[0]} is missing: install iproute2") from error
@@ -49,6 +53,11 @@ def run_all(commands: Sequence[Sequence[str]]) -> None:
     """Run commands one after the other; raises `LabError` at the first that fails."""
     for words in commands:
         run_tool(*words)
+
+
+def run_batch(namespace: str, commands: Sequence[Sequence[str]]) -> None:
+    """Run commands of `ip` inside a namespace by one process; raises `LabError` at the first that fails."""
+    run_tool("ip", "-n", namespace, "-batch", "-", lines="".join(" ".join(words) + "\n" for words in commands))
 
 
 def namespaces() -> tuple[str, ...]:

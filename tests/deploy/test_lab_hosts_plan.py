@@ -177,7 +177,10 @@ def trial(acks_s: list[list[float]], *, is_cut: bool = False) -> HostTrial:
 def test_the_worst_region_counts_and_a_cut_one_from_when_it_is_whole() -> None:
     served, silent = [10.2, 11.0, 12.0, 13.0, 14.2], [9.0, 14.8]
     assert trial([served, silent]).ack_gap_s == pytest.approx(4.8)
+    assert trial([served, silent]).back_s is None
     assert trial([served, silent], is_cut=True).ack_gap_s == pytest.approx(1.2), "the other region's"
+    assert trial([served, silent], is_cut=True).back_s == pytest.approx(0.8), "its end was at 14"
+    assert trial([served, [9.0]], is_cut=True).back_s == pytest.approx(1.0), "not at all until the account ends"
     assert trial([silent, served], is_cut=True).ack_gap_s == pytest.approx(4.8), "the cut one does not excuse it"
     assert trial([served, silent]).acknowledged == 6
     assert trial([served, silent]).as_dict()["tile_gap_s"] == 1.0

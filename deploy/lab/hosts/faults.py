@@ -13,7 +13,7 @@ from gnd.deploy.lab.hosts.cloud import links_of_region, state_of_witness
 from gnd.deploy.lab.hosts.network import LabEnd, lose_between
 from gnd.deploy.lab.hosts.plan import DATABASES, HostsPlan, LabHost
 from gnd.deploy.lab.hosts.running import HostsCloud
-from gnd.deploy.lab.namespaces import pids_in, run_all
+from gnd.deploy.lab.namespaces import pids_in
 
 Way = Literal["process", "host", "silent", "partition", "one-way"]
 GONE_WITHIN_S: Final = 5.0
@@ -121,12 +121,12 @@ def begin_fault(cloud: HostsCloud, fault: HostFault) -> tuple[str, End]:
     if fault.way == "process":
         cloud.lose((part,))
         return f"{part} on {host.name}", lambda: cloud.give_back((part,))
-    undo = _silence(cloud, host) if fault.way == "silent" else ()
+    undo = _silence(cloud, host) if fault.way == "silent" else _nothing
     cloud.lose(host.parts)
     kill_all(host)
 
     def end() -> None:
-        run_all(undo)
+        undo()
         cloud.give_back(host.parts)
 
     return f"{host.name}: {', '.join(host.parts)}", end
@@ -141,25 +141,41 @@ def _part(cloud: HostsCloud, part: str) -> str:
 
 
 def _cut(cloud: HostsCloud, *, both: bool) -> tuple[str, End]:
-    """The last region, its vehicles with it, from all other hosts."""
-    region = cloud.plan.size.regions - 1
-    own = [host for host in cloud.plan.hosts if host.region == region]
-    others = [LabEnd.of_host(host) for host in cloud.plan.hosts if host.region != region]
-    inside = [LabEnd.of_host(host) for host in own]
-    inside += [LabEnd.of_link(link) for link in links_of_region(cloud.plan, cloud.lab, region)]
-    undo = lose_between(cloud.lab.cloud_namespace, inside, others)
-    if both:
-        undo += lose_between(cloud.lab.cloud_namespace, others, inside)
-    return f"region {region}: {', '.join(host.name for host in own)}", lambda: run_all(undo)
+    """The last region, hosts and vehicles, from all others."""
+    *rest, region = range(cloud.plan.size.regions)
+    inside, own = _ends(cloud, region), cloud.plan.in_region(region)
+    others = [end for other in rest for end in _ends(cloud, other)]
+    undo = _lose(cloud, inside, others, both=both)
+    return f"region {region}: {', '.join(host.name for host in own)}", undo
 
 
-def _silence(cloud: HostsCloud, host: LabHost) -> Sequence[tuple[str, ...]]:
+def _nothing() -> None:
+    pass
+
+
+def _lose(cloud: HostsCloud, sources: Sequence[LabEnd], targets: Sequence[LabEnd], *, both: bool) -> End:
+    middle = cloud.lab.cloud_namespace
+    undo = lose_between(middle, sources, targets)
+    undo_other = lose_between(middle, targets, sources) if both else _nothing
+
+    def end() -> None:
+        undo()
+        undo_other()
+
+    return end
+
+
+def _ends(cloud: HostsCloud, region: int) -> list[LabEnd]:
+    links = links_of_region(cloud.plan, cloud.lab, region)
+    return [*map(LabEnd.of_host, cloud.plan.in_region(region)), *map(LabEnd.of_link, links)]
+
+
+def _silence(cloud: HostsCloud, host: LabHost) -> End:
     """Nothing comes from a host any more, and nothing that is sent there is answered."""
     own = LabEnd.of_host(host)
     everybody = [LabEnd.of_host(one) for one in cloud.plan.hosts if one != host]
     everybody += [LabEnd.of_link(link) for link in cloud.lab.links]
-    middle = cloud.lab.cloud_namespace
-    return lose_between(middle, [own], everybody) + lose_between(middle, everybody, [own])
+    return _lose(cloud, [own], everybody, both=True)
 
 
 def kill_all(host: LabHost) -> None:

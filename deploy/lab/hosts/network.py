@@ -3,14 +3,14 @@
 What is cut is dropped in the middle, without word to anybody, as by a network that fails. A host's own end stays up.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
 from gnd.deploy.lab.devices import MTU_BYTES, Command
 from gnd.deploy.lab.groups import LabLink
 from gnd.deploy.lab.hosts.plan import HostsPlan, LabHost
-from gnd.deploy.lab.namespaces import add_namespace, inside, run_all, run_tool
+from gnd.deploy.lab.namespaces import add_namespace, inside, run_all, run_batch, run_tool
 
 RULE_PRIORITY: Final = "100"
 _FORWARD: Final = "/proc/sys/net/ipv4/ip_forward"
@@ -68,11 +68,11 @@ def _cable(host: LabHost, middle: str) -> list[Command]:
     ]
 
 
-def lose_between(middle: str, sources: Iterable[LabEnd], targets: Iterable[LabEnd]) -> tuple[Command, ...]:
+def lose_between(middle: str, sources: Iterable[LabEnd], targets: Iterable[LabEnd]) -> Callable[[], None]:
     """Drop what any of the sources sends to any of the targets; the other way is not touched.
 
     Returns:
-        The commands that undo it.
+        What undoes it.
     """
     targets = tuple(targets)
     words = [
@@ -80,5 +80,5 @@ def lose_between(middle: str, sources: Iterable[LabEnd], targets: Iterable[LabEn
         for source in sources
         for target in targets
     ]
-    run_all([("ip", "-n", middle, "rule", "add", *rule) for rule in words])
-    return tuple(("ip", "-n", middle, "rule", "del", *rule) for rule in words)
+    run_batch(middle, [("rule", "add", *rule) for rule in words])
+    return lambda: run_batch(middle, [("rule", "del", *rule) for rule in words])

@@ -15,11 +15,14 @@ def print_hosts(console: Console, outcome: "HostsOutcome") -> None:
     for name, parts in outcome.plan.items():
         places.add_row(name, ", ".join(parts) or "nothing")
     console.print(places)
-    table = Table("fault", "hit", "lasted, s", "acks", "no ack for, s", "no tile for, s", title="faults")
+    table = Table(
+        "fault", "hit", "lasted, s", "acks", "no ack for, s", "no tile for, s", "back after, s", title="faults"
+    )
     calm = () if outcome.calm is None else (outcome.calm,)
     for trial in (*calm, *outcome.trials):
         told = trial.as_dict()
-        gaps = (f"{told['ack_gap_s']:.2f}", f"{told['tile_gap_s']:.2f}")
+        times_s = (told["ack_gap_s"], told["tile_gap_s"], told["back_s"])
+        gaps = ["" if one is None else f"{one:.2f}" for one in times_s]
         table.add_row(trial.fault, trial.where, f"{told['lasted_s']:.0f}", str(told["acknowledged"]), *gaps)
     console.print(table)
     found = outcome.findings

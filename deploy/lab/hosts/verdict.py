@@ -37,22 +37,30 @@ class HostTrial:
 
     @property
     def ack_gap_s(self) -> float:
-        """The longest time in which vehicles of a region got no acknowledgement; of a cut region since it is whole."""
-        return max(self._gap_s(region, times_s) for region, times_s in enumerate(self.acks_s))
+        """The longest time in which the vehicles of a region got no acknowledgement; a cut region does not count."""
+        return self._gap_s(self.acks_s)
 
     @property
     def tile_gap_s(self) -> float:
         """The same for tiles."""
-        return max(self._gap_s(region, times_s) for region, times_s in enumerate(self.tiles_s))
+        return self._gap_s(self.tiles_s)
+
+    @property
+    def back_s(self) -> float | None:
+        """How long after its end a cut region had an acknowledgement and a tile again; None: none was cut."""
+        if not self.is_cut:
+            return None
+        served = self.acks_s[self.region], self.tiles_s[self.region]
+        return max(next((t for t in times_s if t > self.ended_s), self.until_s) for times_s in served) - self.ended_s
 
     @property
     def acknowledged(self) -> int:
         """Acknowledgements from its begin to the end of its account."""
         return sum(self.began_s <= t <= self.until_s for times_s in self.acks_s for t in times_s)
 
-    def _gap_s(self, region: int, times_s: Sequence[float]) -> float:
-        from_s = self.ended_s if self.is_cut and region == self.region else self.began_s
-        return longest_gap_s(times_s, from_s, self.until_s)
+    def _gap_s(self, by_region: Sequence[Sequence[float]]) -> float:
+        counted = [times_s for region, times_s in enumerate(by_region) if not (self.is_cut and region == self.region)]
+        return max(longest_gap_s(times_s, self.began_s, self.until_s) for times_s in counted)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -63,6 +71,7 @@ class HostTrial:
             "acknowledged": self.acknowledged,
             "ack_gap_s": round(self.ack_gap_s, 2),
             "tile_gap_s": round(self.tile_gap_s, 2),
+            "back_s": None if self.back_s is None else round(self.back_s, 2),
         }
 
 
