@@ -245,9 +245,16 @@ def shown(conninfo: str) -> str:
         return f"postgresql:service={told['service']}"
     user, host, port = (str(told.get(name) or "") for name in ("user", "host", "port"))
     at = f"{quote(user)}@" if user else ""
-    where = host if not host.startswith("/") else ""
+    where = _where(host, port) if not host.startswith("/") else f":{port}" if port else ""
     rest = f"?host={host}" if host.startswith("/") else ""
-    return f"postgresql://{at}{where}{f':{port}' if port else ''}/{told.get('dbname') or ''}{rest}"
+    return f"postgresql://{at}{where}/{told.get('dbname') or ''}{rest}"
+
+
+def _where(hosts: str, ports: str) -> str:
+    """Hosts with their ports, as a URL has them; libpq tells them as two lists, of which one port stands for all."""
+    names, numbers = hosts.split(","), ports.split(",")
+    each = numbers if len(numbers) == len(names) else numbers[:1] * len(names)
+    return ",".join(f"{name}:{number}" if number else name for name, number in zip(names, each, strict=True))
 
 
 def connect(conninfo: str, clock: DatabaseClock) -> PostgresConnection:

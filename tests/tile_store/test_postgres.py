@@ -20,6 +20,7 @@ from gnd.tile_store.uploads import Settled, Upload
 
 psycopg = pytest.importorskip("psycopg", reason="pip install 'gnd-fleet[postgres]'")
 from gnd.tile_store.postgres_connection import SQL, _require_new_enough  # noqa: E402
+from gnd.tile_store.postgres_connection import shown as shown_conninfo  # noqa: E402
 from gnd.tile_store.postgres_store import PostgresStore  # noqa: E402
 from gnd.tile_store.postgres_wire import PostgresWire  # noqa: E402
 
@@ -192,6 +193,17 @@ def test_what_stands_against_a_connection_is_said_in_one_line(
     with pytest.raises(StoreUnavailable, match=says) as caught:
         PostgresStore(change(new_database()))
     assert "\n" not in str(caught.value)
+
+
+def test_of_two_hosts_the_one_that_takes_writes_is_found(postgres: PostgresServer, new_database: NewDatabase) -> None:
+    url = new_database().replace("?host=", "?host=/nowhere,") + "&target_session_attrs=read-write"
+    with PostgresStore(url) as store:
+        store.put_tiles([tile_of_voxels(TILE, 1, 2)])
+        assert store.location.endswith(f"?host=/nowhere,{postgres.folder}")
+    told = "postgresql://gnd@db-a:5432,db-b:5433/gnd"
+    assert shown_conninfo(f"{told}?target_session_attrs=read-write&password=secret") == told
+    assert shown_conninfo("host=a,b port=5432 dbname=d") == "postgresql://a:5432,b:5432/d"
+    assert shown_conninfo("host=a dbname=d") == "postgresql://a/d"
 
 
 def test_a_wrong_password_is_said_and_never_shown(postgres: PostgresServer, new_database: NewDatabase) -> None:

@@ -27,7 +27,7 @@ READY_S: Final = 300.0
 BACK_S: Final = 90.0
 """After a fault all regions must be served again within so long."""
 CALM_S: Final = 5.0
-SETTLE_S: Final = 300.0
+SETTLE_S: Final = 900.0
 HURRIED_S: Final = 45.0
 """So long a run that was interrupted is let settle."""
 SERVED_LATELY_S: Final = 1.5
