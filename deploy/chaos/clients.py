@@ -54,6 +54,7 @@ class ChaosVehicleTask:
         every_s: how often it has one, on average, s.
         link: profile of its link.
         times: a line for each acknowledgement: when it came, s of the machine's monotonic clock; None: nowhere.
+        reports_of_trip: after so many reports it takes another pseudonym, with an outbox of its own.
     """
 
     connect: tuple[str, ...]
@@ -63,6 +64,7 @@ class ChaosVehicleTask:
     every_s: float
     link: str | LinkProfile = "none"
     times: Path | None = None
+    reports_of_trip: int = REPORTS_OF_TRIP
 
 
 class _TimedOutbox(Outbox):
@@ -113,7 +115,7 @@ class _Trips:
         """Put the next report into the outbox; raises OutboxError where it cannot be kept."""
         outbox = self._open[self._pseudonym][0] if self._pseudonym in self._open else self._begin(self._pseudonym)
         number = outbox.counts().total
-        if number >= REPORTS_OF_TRIP:
+        if number >= self._task.reports_of_trip:
             self._trip += 1
             return self.report()
         put(outbox, self._street.said(self._task.seed, self._pseudonym, number))

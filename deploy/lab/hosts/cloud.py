@@ -33,7 +33,9 @@ BUS_LEASE_MS: Final = 2_000
 """A part whose host falls silent is given up by its router after so long."""
 LEASE_S: Final = 2.0
 SHARD_POLL_S: Final = 0.02
-ASK_EVERY_S: Final = 0.05
+REPORTS_OF_TRIP: Final = 60
+"""Each outbox is looked at five times a second as long as one of its reports is not released."""
+ASK_EVERY_S: Final = 0.1
 ASK_S: Final = 20.0
 
 
@@ -150,7 +152,9 @@ def client_processes(plan: HostsPlan, lab: Lab, folders: LabFolders, seed: int, 
             if name.startswith("asker"):
                 spec = ProcessSpec(name, asker, (routers, session, name, times), namespace=link.vehicle_namespace)
             else:
-                task = clients.ChaosVehicleTask(routers, name, folders.vehicles, seed, every_s, session, times)
+                task = clients.ChaosVehicleTask(
+                    routers, name, folders.vehicles, seed, every_s, session, times, REPORTS_OF_TRIP
+                )
                 spec = ProcessSpec(name, clients.vehicle, (task,), namespace=link.vehicle_namespace)
             specs.append(spec)
     return specs
