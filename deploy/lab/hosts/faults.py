@@ -122,8 +122,7 @@ def begin_fault(cloud: HostsCloud, fault: HostFault) -> tuple[str, End]:
         cloud.lose((part,))
         return f"{part} on {host.name}", lambda: cloud.give_back((part,))
     undo = _silence(cloud, host) if fault.way == "silent" else _nothing
-    cloud.lose(host.parts)
-    kill_all(host)
+    cloud.lose(host.parts, lambda: kill_all(host))  # at once: who outlives its router would go to another one
 
     def end() -> None:
         undo()

@@ -12,7 +12,7 @@ MOST_HOSTS: Final = 32
 MOST_VEHICLES: Final = 50
 DATABASES: Final = ("database-a", "database-b")
 WITNESS: Final = "witness"
-HUB: Final = "hub"
+HUBS: Final = ("hub-a", "hub-b")
 OF_REGION: Final = ("router", "tiles", "shard")
 """What every region has."""
 ROUTER_PORT: Final = 7447
@@ -115,13 +115,13 @@ class HostsPlan:
         return tuple(host for host in self.hosts if host.region == region)
 
     @property
-    def hub(self) -> str:
-        """Endpoint of the hub's router."""
-        return f"tcp/{self.host_of(HUB).address}:{HUB_PORT}"
+    def hubs(self) -> tuple[str, ...]:
+        """Endpoints of the hubs."""
+        return tuple(f"tcp/{self.host_of(hub).address}:{HUB_PORT}" for hub in HUBS)
 
-    def routers(self, region: int) -> tuple[str, str]:
-        """Endpoints that a client of a region has: of its region's router, and of the hub."""
-        return f"tcp/{self.host_of(f'router-{region}').address}:{ROUTER_PORT}", self.hub
+    def routers(self, region: int) -> tuple[str, ...]:
+        """Endpoints that a client of a region has: of its region's router, and of the hubs."""
+        return f"tcp/{self.host_of(f'router-{region}').address}:{ROUTER_PORT}", *self.hubs
 
     @property
     def database_url(self) -> str:
@@ -139,7 +139,8 @@ def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:
 
     Hosts are shared out among the regions in order. The database's two sides come first, in the first region where it
     has two hosts; then what belongs to a region, each on the host of its region that has least to do and no database
-    if there is one; hub and witness where least is to do. Without a third host there is no witness.
+    if there is one; a hub in the first region and one in the last, on another host; a witness where least is to do and
+    no database is. Without a third host there is no witness.
 
     Args:
         lab: name of the laboratory.
@@ -154,10 +155,12 @@ def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:
     for region in range(size.regions):
         own = [number for number, where in enumerate(regions) if where == region]
         placed += _spread([f"{part}-{region}" for part in OF_REGION], own, placed)
-    everywhere = range(size.hosts)
-    placed += _spread([HUB], everywhere, placed)
+    placed += _spread(HUBS[:1], [number for number, where in enumerate(regions) if where == 0], placed)
+    others = [number for number in range(size.hosts) if number != placed[-1][1]]
+    last = [number for number in others if regions[number] == size.regions - 1]
+    placed += _spread(HUBS[1:], last or others, placed)
     if size.hosts > len(DATABASES):
-        placed += _spread([WITNESS], [n for n in everywhere if n >= len(DATABASES)], placed)
+        placed += _spread([WITNESS], range(len(DATABASES), size.hosts), placed)
     hosts = (
         LabHost(lab, number, region, tuple(part for part, where in placed if where == number))
         for number, region in enumerate(regions)

@@ -66,9 +66,10 @@ class HostsCloud:
                 self._specs[spec.name] = spec
                 self.supervisor.start(spec)
 
-    def lose(self, parts: Iterable[str]) -> None:
-        """Kill parts with all that they have started; they stay away."""
+    def lose(self, parts: Iterable[str], first: Callable[[], None] = lambda: None) -> None:
+        """Kill parts with all that they have started; they stay away. `first` comes before, and nothing between."""
         with self._lock:
+            first()
             pids = self.supervisor.pids()
             names = tuple(part for part in parts if part in pids)
             for name in names:
@@ -141,7 +142,7 @@ def running_hosts(
             store.put_tiles(street.tiles)
         _until(lambda: _has_standby(cloud), "the standby follows")
         cloud.start(cloud_processes(plan))
-        with open_bus(BusConfig(connect=(plan.hub,), open_timeout_s=READY_S), name="probe") as bus:
+        with open_bus(BusConfig(connect=plan.hubs, open_timeout_s=READY_S), name="probe") as bus:
             bus.request(tile_key(LAYER, street.tiles[0].tile_id), b"", kind="tile", timeout_s=READY_S)
         cloud.start(client_processes(plan, lab, folders, *clients))
         stack.enter_context(repeated(lambda _n: cloud.poll(), POLL_S, "supervisor"))
