@@ -17,7 +17,7 @@ from gnd.deploy.lab.groups import DEFAULT_GROUPS
 from gnd.deploy.lab.hosts import data
 from gnd.deploy.lab.hosts.cloud import read_times
 from gnd.deploy.lab.hosts.faults import FAULTS, chosen_faults, parse_faults
-from gnd.deploy.lab.hosts.plan import DATABASES, HUBS, OF_REGION, HostsSize, plan_hosts
+from gnd.deploy.lab.hosts.plan import DATABASES, OF_REGION, HostsSize, plan_hosts
 from gnd.deploy.lab.hosts.run import HostsOptions
 from gnd.deploy.lab.hosts.verdict import HostsOutcome, HostTrial, longest_gap_s
 from gnd.deploy.lab.hosts.witness import WitnessClient, WitnessState, witness
@@ -29,9 +29,8 @@ def test_every_part_has_one_host_and_sides_that_stand_in_for_each_other_have_two
     plan = plan_hosts("t", HostsSize(regions, hosts))
     parts = [part for host in plan.hosts for part in host.parts]
     of_regions = {f"{part}-{region}" for part in OF_REGION for region in range(regions)}
-    assert sorted(parts) == sorted({*DATABASES, *HUBS, *of_regions, *(["witness"] if hosts > 2 else [])})
+    assert sorted(parts) == sorted({*DATABASES, "hub", *of_regions, *(["witness"] if hosts > 2 else [])})
     assert plan.host_of(DATABASES[0]) != plan.host_of(DATABASES[1])
-    assert plan.host_of(HUBS[0]) != plan.host_of(HUBS[1])
     assert {host.region for host in plan.hosts} == set(range(regions))
     assert all(plan.host_of(f"{part}-{r}").region == r for part in OF_REGION for r in range(regions))
     if hosts > 2:
@@ -42,7 +41,8 @@ def test_every_part_has_one_host_and_sides_that_stand_in_for_each_other_have_two
 def test_with_room_nothing_shares_a_host_with_the_database() -> None:
     plan = plan_hosts("t", HostsSize(regions=2, hosts=12))
     assert [plan.host_of(part).parts for part in DATABASES] == [("database-a",), ("database-b",)]
-    assert max(len(host.parts) for host in plan.hosts) == 1
+    assert plan.host_of("hub").parts == ("router-1", "hub")
+    assert max(len(host.parts) for host in plan.hosts) == 2
 
 
 def test_a_store_is_looked_for_at_both_hosts_and_written_where_it_can_be() -> None:

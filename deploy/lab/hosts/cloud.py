@@ -16,7 +16,7 @@ from gnd.deploy.chaos import clients
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.lab.groups import Group, LabLink, unpaced
 from gnd.deploy.lab.hosts.database import DatabaseSide, database
-from gnd.deploy.lab.hosts.plan import DATABASES, HUBS, ROUTER_PORT, WITNESS, WITNESS_PORT, HostsPlan
+from gnd.deploy.lab.hosts.plan import DATABASES, HUB, WITNESS, WITNESS_PORT, HostsPlan
 from gnd.deploy.lab.hosts.witness import witness
 from gnd.deploy.lab.lab import Lab
 from gnd.deploy.processes import ProcessSpec
@@ -113,18 +113,16 @@ def database_processes(plan: HostsPlan, folders: LabFolders) -> list[ProcessSpec
 
 
 def cloud_processes(plan: HostsPlan) -> list[ProcessSpec]:
-    """The hubs, linked with each other, and each region's router, tile server and shard."""
-    specs = [
-        ProcessSpec(hub, lab_router, (endpoint, plan.hubs[:number]), namespace=plan.host_of(hub).namespace)
-        for number, (hub, endpoint) in enumerate(zip(HUBS, plan.hubs, strict=True))
-    ]
+    """The hub, and each region's router, tile server and shard."""
+    specs = [ProcessSpec(HUB, lab_router, (plan.hub, ()), namespace=plan.host_of(HUB).namespace)]
     for region in range(plan.size.regions):
         routers = plan.routers(region)
         at = {part: plan.host_of(f"{part}-{region}") for part in ("router", "tiles", "shard")}
-        listen = f"tcp/{at['router'].address}:{ROUTER_PORT}"
         shard = shard_config(f"shard-{region}", plan.database_url, routers)
         specs += [
-            ProcessSpec(f"router-{region}", lab_router, (listen, plan.hubs), namespace=at["router"].namespace),
+            ProcessSpec(
+                f"router-{region}", lab_router, (plan.router(region), (plan.hub,)), namespace=at["router"].namespace
+            ),
             ProcessSpec(f"tiles-{region}", lab_tiles, (plan.database_url, routers), namespace=at["tiles"].namespace),
             ProcessSpec(f"shard-{region}", roles.merger, (shard,), namespace=at["shard"].namespace),
         ]

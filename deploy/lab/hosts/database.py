@@ -83,7 +83,7 @@ def _remembered(client: WitnessClient, stop: threading.Event) -> WitnessState:
     return WitnessState(DATABASES[0])
 
 
-class _Side:
+class _WatchedSide:
     """What both have: a server, a connection to it, and since when the other is missed."""
 
     def __init__(self, side: DatabaseSide, client: WitnessClient) -> None:
@@ -139,7 +139,7 @@ class _Side:
             end_server(self._process)
 
 
-class _Primary(_Side):
+class _Primary(_WatchedSide):
     """Takes writes."""
 
     _waits = False  # commits wait for the other
@@ -201,7 +201,7 @@ class _Primary(_Side):
         self._waits, self._waits_since_s = bool(name), time.monotonic()
 
 
-class _Standby(_Side):
+class _Standby(_WatchedSide):
     """Follows the other, and takes over where the witness says so."""
 
     def begin(self, _state: WitnessState, stop: threading.Event) -> bool:

@@ -12,7 +12,7 @@ MOST_HOSTS: Final = 32
 MOST_VEHICLES: Final = 50
 DATABASES: Final = ("database-a", "database-b")
 WITNESS: Final = "witness"
-HUBS: Final = ("hub-a", "hub-b")
+HUB: Final = "hub"
 OF_REGION: Final = ("router", "tiles", "shard")
 """What every region has."""
 ROUTER_PORT: Final = 7447
@@ -115,13 +115,18 @@ class HostsPlan:
         return tuple(host for host in self.hosts if host.region == region)
 
     @property
-    def hubs(self) -> tuple[str, ...]:
-        """Endpoints of the hubs."""
-        return tuple(f"tcp/{self.host_of(hub).address}:{HUB_PORT}" for hub in HUBS)
+    def hub(self) -> str:
+        """Endpoint of the hub."""
+        return f"tcp/{self.host_of(HUB).address}:{HUB_PORT}"
+
+    def router(self, region: int) -> str:
+        """Endpoint of a region's router."""
+        return f"tcp/{self.host_of(f'router-{region}').address}:{ROUTER_PORT}"
 
     def routers(self, region: int) -> tuple[str, ...]:
-        """Endpoints that a client of a region has: of its region's router, and of the hubs."""
-        return f"tcp/{self.host_of(f'router-{region}').address}:{ROUTER_PORT}", *self.hubs
+        """Endpoints of a region's clients, in order: its own router, the hub, the routers of other regions."""
+        others = (self.router(other) for other in range(self.size.regions) if other != region)
+        return self.router(region), self.hub, *others
 
     @property
     def database_url(self) -> str:
@@ -139,8 +144,8 @@ def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:
 
     Hosts are shared out among the regions in order. The database's two sides come first, in the first region where it
     has two hosts; then what belongs to a region, each on the host of its region that has least to do and no database
-    if there is one; a hub in the first region and one in the last, on another host; a witness where least is to do and
-    no database is. Without a third host there is no witness.
+    if there is one; the hub beside the last region's router, so that no tile server is lost with the way to the
+    others; a witness where least is to do and no database is. Without a third host there is no witness.
 
     Args:
         lab: name of the laboratory.
@@ -155,10 +160,7 @@ def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:
     for region in range(size.regions):
         own = [number for number, where in enumerate(regions) if where == region]
         placed += _spread([f"{part}-{region}" for part in OF_REGION], own, placed)
-    placed += _spread(HUBS[:1], [number for number, where in enumerate(regions) if where == 0], placed)
-    others = [number for number in range(size.hosts) if number != placed[-1][1]]
-    last = [number for number in others if regions[number] == size.regions - 1]
-    placed += _spread(HUBS[1:], last or others, placed)
+    placed.append((HUB, dict(placed)[f"router-{size.regions - 1}"]))
     if size.hosts > len(DATABASES):
         placed += _spread([WITNESS], range(len(DATABASES), size.hosts), placed)
     hosts = (

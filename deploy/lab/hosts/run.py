@@ -138,6 +138,7 @@ class _Course:
                     raise LabError(f"nothing was merged within {READY_S:g} s: read {logs}; {self._cloud.died}")
                 if self._stop.wait(_LOOK_S):
                     return
+        self._stop.wait(CALM_S)  # shards come to know each other
 
     def calm(self) -> HostTrial:
         """Some seconds without a fault: what pauses there are anyway."""

@@ -142,7 +142,7 @@ def running_hosts(
             store.put_tiles(street.tiles)
         _until(lambda: _has_standby(cloud), "the standby follows")
         cloud.start(cloud_processes(plan))
-        with open_bus(BusConfig(connect=plan.hubs, open_timeout_s=READY_S), name="probe") as bus:
+        with open_bus(BusConfig(connect=(plan.hub,), open_timeout_s=READY_S), name="probe") as bus:
             bus.request(tile_key(LAYER, street.tiles[0].tile_id), b"", kind="tile", timeout_s=READY_S)
         cloud.start(client_processes(plan, lab, folders, *clients))
         stack.enter_context(repeated(lambda _n: cloud.poll(), POLL_S, "supervisor"))

@@ -50,11 +50,11 @@ class WitnessState:
         raise LabError(f"a witness is not asked {word!r}")
 
 
-class _Server(socketserver.ThreadingTCPServer):
+class _WitnessServer(socketserver.ThreadingTCPServer):
     allow_reuse_address, daemon_threads = True, True
 
     def __init__(self, address: tuple[str, int], file: Path, first: str) -> None:
-        super().__init__(address, _Handler)
+        super().__init__(address, _WitnessHandler)
         self._file, self._lock = file, threading.Lock()
         self._state = WitnessState(**json.loads(file.read_text())) if file.exists() else WitnessState(first)
 
@@ -77,9 +77,9 @@ class _Server(socketserver.ThreadingTCPServer):
         self._state = state
 
 
-class _Handler(socketserver.StreamRequestHandler):
+class _WitnessHandler(socketserver.StreamRequestHandler):
     timeout = 2.0
-    server: _Server
+    server: _WitnessServer
 
     def handle(self) -> None:
         """One question."""
@@ -99,7 +99,7 @@ def witness(address: tuple[str, int], file: Path, first: str, *, stop: threading
         first: who takes writes where nothing is remembered.
         stop: ends it.
     """
-    with _Server(address, file, first) as server:
+    with _WitnessServer(address, file, first) as server:
         thread = threading.Thread(target=server.serve_forever, name="witness", daemon=True)
         thread.start()
         wait_for_stop(stop)
