@@ -15,7 +15,7 @@ from typing import Final
 from gnd.deploy.errors import LabError
 
 NETNS_FOLDER: Final = Path("/run/netns")
-COMMAND_TIMEOUT_S: Final = 20.0
+COMMAND_TIMEOUT_S: Final = 60.0
 _CLONE_NEWNET: Final = 0x40000000  # linux/sched.h
 _OWN: Final = Path("/proc/thread-self/ns/net")
 

@@ -16,7 +16,7 @@ from gnd.deploy.lab.hosts.running import HostsCloud
 from gnd.deploy.lab.namespaces import pids_in
 
 Way = Literal["process", "host", "silent", "partition", "one-way"]
-GONE_WITHIN_S: Final = 5.0
+GONE_WITHIN_S: Final = 30.0
 _LOOK_S: Final = 0.01
 
 End = Callable[[], None]
