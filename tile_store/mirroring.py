@@ -84,6 +84,7 @@ def _put(c: SqlConnection, layer: str, one: MirroredTile, now: int) -> None:
         "size_bytes": len(blob.body),
         "provenance": encode_provenance(NOTHING),
         "body": blob.body,
+        "body_check": None,  # it comes from elsewhere: it is read before it is sent
         "epoch": blob.version,
     }
     post(c, "insert_version", row | _signed(c, one))
