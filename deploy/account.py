@@ -110,11 +110,13 @@ class TileHistory:
         before: Gaussians of the epoch, empty where the tile was not mapped.
         after: Gaussians of the newest version.
         tile: the newest version as stored.
+        base: the version of the epoch as stored, None where the tile was not mapped.
     """
 
     tile: StoredTile
     before: Gaussians
     after: Gaussians
+    base: StoredTile | None = None
 
     def changed_voxels(self) -> int:
         """Return how many voxels differ."""
@@ -134,4 +136,4 @@ def _history(store: SqlStore, layer: str, tile: Any, version: int) -> TileHistor
     bases = [info.version for info in store.history(layer, tile) if info.kind != "merged"]
     base = store.get(layer, tile, bases[-1]) if bases else None
     before = Gaussians.empty() if base is None else base.decode_gaussians().gaussians
-    return TileHistory(head, before, head.decode_gaussians().gaussians)
+    return TileHistory(head, before, head.decode_gaussians().gaussians, base)

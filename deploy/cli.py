@@ -28,6 +28,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "gnd.deploy.traffic_cli:traffic",
         "Every byte of a run, compared with 3G, 4G and 5G; also as a page.",
     ),
+    "report": (
+        "gnd.deploy.report.command:report",
+        "A finished run as one page to send: maps, changes, figures; also as PDF.",
+    ),
     "map": ("gnd.deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
     "shards": ("gnd.cloud_merger.shards_cli:shards", "Who merges a map: shards, their districts, their queues."),
     "regions": (
@@ -45,6 +49,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "localise": ("gnd.vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
     "play": ("gnd.deploy.play:play_command", "Publish a recording as sensors would: ROS 2 topics, or plain keys."),
+    "doctor": ("gnd.deploy.doctor.command:doctor", "What keeps programs from working here, and what to do about it."),
     "config": ("gnd.deploy.config_cli:config", "Show and check the settings of the programs."),
     "sim": ("gnd.fleet_sim.cli:sim", "Write and inspect simulated worlds and drives."),
     "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and compare them with ours."),

@@ -7,6 +7,7 @@ GndError
     ├── LabError           namespaces or shaped links cannot be made or are taken
     │   └── LabRuns        a lab of that name is running
     ├── PageError          a page cannot be written
+    ├── ReportError        a run cannot be reported
     ├── ChaosError         a chaos run cannot start, or its street cannot be read
     ├── LoadError          a load cannot be made
     └── NoStudies          the papers' results can be reproduced in a checkout only
@@ -37,6 +38,10 @@ class LabRuns(LabError):
 
 class PageError(DeployError):
     """A page cannot be written."""
+
+
+class ReportError(DeployError):
+    """A run cannot be reported: it is none, its map is missing, or there is no browser that prints."""
 
 
 class ChaosError(DeployError):

@@ -18,6 +18,7 @@ from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
 from gnd.deploy.fleet_identities import make_identities
 from gnd.deploy.next_commands import after_fleet
 from gnd.deploy.ports import claim_port
+from gnd.deploy.report.software import software
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from gnd.deploy.site import SiteFrame
 from gnd.deploy.source import Source
@@ -136,7 +137,7 @@ def fleet(
     claim_port(config.port)
     folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
     write_settings(config, folder.root)
-    folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
+    folder.write_mark(mark_of(config, source, secure=secure))
     source = _imported(source, folder, quiet=as_json)
     if not as_json:
         click.echo(_SECURE if secure else _PLAIN, err=True)
@@ -145,6 +146,18 @@ def fleet(
     if base_map is not None and not as_json:
         for line in after_fleet(summary, base_map, folder):
             click.echo(line)
+
+
+def mark_of(config: FleetConfig, source: Source, **more: Any) -> dict[str, Any]:
+    """What a run writes down of how it was made: settings, recordings, versions of the programs."""
+    return {
+        "config": dataclasses.asdict(config),
+        "drives": [str(path) for path in source.drives],
+        "map": None if source.base_map is None else str(source.base_map),
+        "made_up": source.made_up,
+        "software": software(),
+        **more,
+    }
 
 
 def _imported(source: Source, folder: RunFolder, *, quiet: bool) -> Source:

@@ -1,8 +1,10 @@
 """Pages as one HTML file: no script, nothing from elsewhere, readable on a phone, light and dark."""
 
+import base64
 import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from html import escape
 from pathlib import Path
 from typing import Final
 
@@ -73,6 +75,29 @@ def section(title: str, content: str) -> str:
 def card_list(items: Iterable[tuple[str, str]]) -> str:
     """Large values, each with what it is."""
     return f'<ul class="cards">{"".join(f"<li><b>{value}</b><span>{what}</span></li>" for value, what in items)}</ul>'
+
+
+def text_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
+    """A table of plain text, which is escaped here; the first `left` columns are words, the others numbers."""
+    head = "".join(f"<th{_side(n, left)}>{escape(one)}</th>" for n, one in enumerate(header))
+    body = "".join(
+        "<tr>" + "".join(f"<td{_side(n, left)}>{escape(one)}</td>" for n, one in enumerate(row)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _side(column: int, left: int) -> str:
+    return " class=t" if column < left else ""
+
+
+def picture(image: bytes, caption: str) -> str:
+    """A PNG within the page; the caption is plain text."""
+    data = base64.b64encode(image).decode()
+    return (
+        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
 
 
 def check_writable(path: Path) -> None:

@@ -1,12 +1,11 @@
 """The quality of a map as a page."""
 
-import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from gnd.deploy.html_page import card_list, document, section, write_html
+from gnd.deploy.html_page import card_list, document, picture, section, text_table, write_html
 from gnd.deploy.map_page_pictures import height_picture, map_picture, thickness_picture
 from gnd.vehicle_agent.map_build.build import BuiltMap
 from gnd.vehicle_agent.map_build.quality import MOST_DOUBLED_ROAD, MOST_DOUBLED_WALLS, MOST_THICK_M, Quality
@@ -39,12 +38,12 @@ def page(title: str, built: BuiltMap, quality: Quality) -> str:
             f"{told['scans']} scans, {told['tiles']} tiles, {told['gaussians']:,} voxels</p></header>",
             _warnings(quality.warnings),
             _cards(told),
-            section("From above", _figure(map_picture(built, quality), "Planes by thickness, ways, doubled surfaces")),
+            section("From above", picture(map_picture(built, quality), "Planes by thickness, ways, doubled surfaces")),
             section("Doubled surfaces and thick planes", _DOUBLE + _surfaces(told["quality"])),
-            section("", _figure(thickness_picture(quality), "Thickness of planes")),
+            section("", picture(thickness_picture(quality), "Thickness of planes")),
             section("Poses", _poses(built)),
             section("By drive", _drives(told["by_drive"])),
-            section("The LiDAR over the road", _figure(height_picture(built, quality), "Height along the way")),
+            section("The LiDAR over the road", picture(height_picture(built, quality), "Height along the way")),
         ),
         _MORE_STYLE,
     )
@@ -88,7 +87,7 @@ def _surfaces(quality: dict[str, Any]) -> str:
         one = quality[key]
         apart = "" if one["apart_m_p50"] is None else f"{one['apart_m_p50']:.2f} m"
         rows.append((name, f"{one['surfaces']:,}", f"{one['doubled']:,}", f"{one['per_thousand']:.1f}", apart))
-    return _table(("", "surfaces", "doubled", "of 1,000", "apart (median)"), rows)
+    return text_table(("", "surfaces", "doubled", "of 1,000", "apart (median)"), rows)
 
 
 def _poses(built: BuiltMap) -> str:
@@ -105,7 +104,7 @@ def _poses(built: BuiltMap) -> str:
         )
     rows = [_drift(name, drift) for name, drift in (("before", poses.before), ("after", poses.after)) if drift]
     header = ("passes off each other", "places", "horizontal", "95 %", "height", "angle", "95 %")
-    return text + (_table(header, rows) if rows else "")
+    return text + (text_table(header, rows) if rows else "")
 
 
 def _drift(name: str, drift: PassDrift) -> tuple[str, ...]:
@@ -139,25 +138,8 @@ def _drives(drives: Sequence[dict[str, Any]]) -> str:
             )
         )
     header = ("drive", "way", "scans", "without pose", "movers", "bodywork", "LiDAR over road, header", "seen")
-    return _table(header, rows)
+    return text_table(header, rows)
 
 
 def _share(part: int, whole: int) -> str:
     return f"{100 * part / max(whole, 1):.2f} %"
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    head = "".join(f"<th{' class=t' if n == 0 else ''}>{escape(one)}</th>" for n, one in enumerate(header))
-    body = "".join(
-        "<tr>" + "".join(f"<td{' class=t' if n == 0 else ''}>{escape(one)}</td>" for n, one in enumerate(row)) + "</tr>"
-        for row in rows
-    )
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def _figure(png: bytes, caption: str) -> str:
-    data = base64.b64encode(png).decode()
-    return (
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )

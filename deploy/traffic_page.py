@@ -1,6 +1,6 @@
 """The account of a run as a page."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
@@ -30,21 +30,19 @@ def page(run: str, agents: Sequence[AgentTraffic], links: Sequence[LinkProfile])
         links: profiles to compare with.
     """
     title = f"Traffic of {escape(run)}"
-    kinds = kinds_table(agents) + _notes(agents) + _details("How bytes are counted", _HOW)
-    on_links = links_table(agents, links) + _details("Where the figures come from", sources(links))
-    return document(
-        title,
-        (
-            f"<header><h1>{title}</h1>{_subtitle(agents)}</header>",
-            cards(agents),
-            section("By kind of message", kinds),
-            section("Along the drive", _along(agents, links)),
-            section("On mobile links", on_links),
-            section("Time that a tile needs to arrive", arrivals_text(agents)),
-            section("Bytes by tile", tile_map(fleet_tiles(agents))),
-            section("By vehicle", agents_table(agents)),
-        ),
-    )
+    parts = (section(name, content) if name else content for name, content in traffic_sections(agents, links))
+    return document(title, (f"<header><h1>{title}</h1>{_subtitle(agents)}</header>", *parts))
+
+
+def traffic_sections(agents: Sequence[AgentTraffic], links: Sequence[LinkProfile]) -> Iterator[tuple[str, str]]:
+    """Titles and contents of the parts of the page, as HTML; the cards have no title."""
+    yield "", cards(agents)
+    yield "By kind of message", kinds_table(agents) + _notes(agents) + _details("How bytes are counted", _HOW)
+    yield "Along the drive", _along(agents, links)
+    yield "On mobile links", links_table(agents, links) + _details("Where the figures come from", sources(links))
+    yield "Time that a tile needs to arrive", arrivals_text(agents)
+    yield "Bytes by tile", tile_map(fleet_tiles(agents))
+    yield "By vehicle", agents_table(agents)
 
 
 def write_page(path: Path, run: str, agents: Sequence[AgentTraffic], links: Sequence[LinkProfile]) -> None:

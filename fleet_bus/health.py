@@ -16,6 +16,7 @@ from typing import Any, Final, Self
 from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
+from gnd.fleet_bus.build_info import register_build
 from gnd.fleet_bus.errors import PortInUse
 
 CHECK_S: Final = 3.0
@@ -34,7 +35,7 @@ class HealthServer:
 
     Args:
         port: where; 0 takes a free one.
-        registry: of the metrics; those of the process itself are added.
+        registry: of the metrics; those of the process itself, its versions and its clock are added.
         checks: by name, what has to be well.
         host: address to listen at; the default is this machine's own alone.
 
@@ -46,6 +47,7 @@ class HealthServer:
         self, port: int, registry: CollectorRegistry, checks: Mapping[str, Check], *, host: str = "127.0.0.1"
     ) -> None:
         ProcessCollector(registry=registry)
+        register_build(registry)
         self._registry = registry
         self._checks = {name: _Watched(check) for name, check in checks.items()}
         try:

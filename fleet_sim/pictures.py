@@ -1,5 +1,6 @@
 """Pictures of a map as coloured ellipsoids, as in Figure 16 of the GND paper: from above, and in perspective."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
@@ -20,6 +21,7 @@ from gnd.fleet_sim.truth import Truth
 from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
 
 FloatArray = NDArray[np.float64]
+Colours = Mapping[ChangeClass, str]
 
 _DPI: Final = 150
 _SIGMAS: Final = 1.9
@@ -94,21 +96,34 @@ class StreetView:
 def draw_map(
     ellipsoids: Ellipsoids, path: Path, title: str, note: str = "", view: StreetView | None = None, dpi: int = _DPI
 ) -> None:
-    """Draw a map from above and in perspective, with legend and scale, as one PNG.
+    """Draw `map_figure` as one PNG.
+
+    Raises:
+        SimError: the file cannot be written.
+    """
+    save_figure(map_figure(ellipsoids, title, note, view, dpi), path)
+
+
+def map_figure(
+    ellipsoids: Ellipsoids,
+    title: str,
+    note: str = "",
+    view: StreetView | None = None,
+    dpi: int = _DPI,
+    colours: Colours = CLASS_COLOURS,
+) -> Figure:
+    """Draw a map from above and in perspective, with legend and scale.
 
     At 150 dots an inch it has 1890 x 1260 pixels; a street of more than 260 m is shown from above in several rows, each
     of which adds 415.
 
     Args:
         ellipsoids: what to draw.
-        path: the PNG to write.
         title: heading of the picture.
         note: small line below the heading.
         view: the same view for several pictures makes them comparable; by default it is fitted.
         dpi: dots an inch; the picture is 12.6 inches wide.
-
-    Raises:
-        SimError: the file cannot be written.
+        colours: of the classes; by default the paper's.
     """
     view = view or StreetView.around(ellipsoids)
     rows = view.rows()
@@ -116,12 +131,12 @@ def draw_map(
     figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=dpi, facecolor=_PAPER)
     figure.text(0.03, 1.0 - 0.361 / height_in, title, fontsize=19, weight="bold", color=_INK, va="center")
     figure.text(0.03, 1.0 - 0.655 / height_in, note, fontsize=11, color="#5a6675", va="center")
-    _legend(figure, 1.0 - 0.353 / height_in, ellipsoids)
+    _legend(figure, 1.0 - 0.353 / height_in, ellipsoids, colours)
     for index, row in enumerate(rows):
         bottom_in = height_in - _HEAD_IN - (index + 1) * _ROW_IN - index * _GAP_IN
-        _from_above(_panel(figure, bottom_in, _ROW_IN), ellipsoids, row)
-    _in_perspective(_panel(figure, _FOOT_IN, _PERSPECTIVE_IN), ellipsoids, view)
-    save_figure(figure, path)
+        _from_above(_panel(figure, bottom_in, _ROW_IN), ellipsoids, row, colours)
+    _in_perspective(_panel(figure, _FOOT_IN, _PERSPECTIVE_IN), ellipsoids, view, colours)
+    return figure
 
 
 def _panel(figure: Figure, bottom_in: float, tall_in: float) -> Axes:
@@ -197,27 +212,29 @@ def save_figure(figure: Figure, path: Path) -> None:
         raise SimError(f"cannot write the picture {path}: {error}") from error
 
 
-def _legend(figure: Figure, height: float, ellipsoids: Ellipsoids | None = None) -> None:
+def _legend(
+    figure: Figure, height: float, ellipsoids: Ellipsoids | None = None, colours: Colours = CLASS_COLOURS
+) -> None:
     """The colours, with the number of ellipsoids of each where they are given."""
     number = ["" for _ in ChangeClass]
     if ellipsoids is not None:
         count = np.bincount(ellipsoids.change_class, minlength=len(ChangeClass))
         number = [f"  {n:,}" for n in count.tolist()]
     dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 9}
-    handles = [Line2D([], [], color=CLASS_COLOURS[c], label=f"{c.name.lower()}{number[c]}", **dot) for c in _SHOWN]
+    handles = [Line2D([], [], color=colours[c], label=f"{c.name.lower()}{number[c]}", **dot) for c in _SHOWN]
     figure.legend(
         handles=handles, loc="center right", bbox_to_anchor=(0.978, height), ncols=4, frameon=False, fontsize=11,
         handletextpad=0.2, columnspacing=1.4, labelcolor=_INK,
     )  # fmt: skip
 
 
-def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: StreetView) -> None:
+def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: StreetView, palette: Colours = CLASS_COLOURS) -> None:
     R = view.R_view_map
     mean, cov = (ellipsoids.mean_m - np.array(view.origin_m)) @ R.T, R @ ellipsoids.cov_m2 @ R.T
     inside = np.flatnonzero((np.abs(mean[:, 0]) < view.half_length_m) & (np.abs(mean[:, 1]) < _HALF_WIDTH_M))
     order = inside[np.argsort(mean[inside, 2], kind="stable")]
-    colours = _shaded(cov[order], ellipsoids.change_class[order], np.array([0.0, 0.0, 1.0]))
-    _add_ellipses(axes, mean[order, :2], cov[order, :2, :2], colours)
+    colours = shaded(cov[order], ellipsoids.change_class[order], np.array([0.0, 0.0, 1.0]), palette)
+    add_ellipses(axes, mean[order, :2], cov[order, :2, :2], colours)
     half_width = view.half_length_m * _ROW_IN / _PANEL_IN
     axes.set(xlim=(-view.half_length_m, view.half_length_m), ylim=(-half_width, half_width), aspect="equal")
     _frame(axes, _PAPER)
@@ -225,7 +242,7 @@ def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: StreetView) -> None:
     _north(axes, view, half_width)
 
 
-def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: StreetView) -> None:
+def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: StreetView, palette: Colours) -> None:
     """Ellipsoids seen from above one end of the street; outlines are covariances through the projection's Jacobian."""
     eye, target = np.array([view.focus_m - 66.0, -13.0, 33.0]), np.array([view.focus_m + 2.0, 1.0, 0.0])
     R = _looking(eye, target) @ view.R_view_map
@@ -237,9 +254,9 @@ def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: StreetView) -> Non
     J = np.zeros((len(p), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = _FOCAL / p[:, 2]
     J[:, :, 2] = -centre / p[:, 2:]
-    colours = _shaded(cov, ellipsoids.change_class[order], R @ view.R_view_map.T @ _SUN)
+    colours = shaded(cov, ellipsoids.change_class[order], R @ view.R_view_map.T @ _SUN, palette)
     haze = np.clip((p[:, 2:] - 60.0) / 260.0, 0.0, 0.55)
-    _add_ellipses(axes, centre, J @ cov @ np.swapaxes(J, 1, 2), colours * (1 - haze) + np.array(to_rgb(_SKY)) * haze)
+    add_ellipses(axes, centre, J @ cov @ np.swapaxes(J, 1, 2), colours * (1 - haze) + np.array(to_rgb(_SKY)) * haze)
     tall = _PERSPECTIVE_IN / _PANEL_IN
     axes.set(xlim=(-1.0, 1.0), ylim=(-tall, tall), aspect="equal")
     _frame(axes, _SKY)
@@ -253,10 +270,11 @@ def _looking(eye: FloatArray, target: FloatArray) -> FloatArray:
     return rows
 
 
-def _shaded(cov: FloatArray, change_class: NDArray[np.uint8], sun: FloatArray) -> FloatArray:
+def shaded(
+    cov: FloatArray, change_class: NDArray[np.uint8], sun: FloatArray, palette: Colours = CLASS_COLOURS
+) -> FloatArray:
     """Colours (N, 3): the class's, lighter where the flat side of the ellipsoid faces the sun."""
-    palette = np.array([to_rgb(CLASS_COLOURS[c]) for c in ChangeClass])
-    base: FloatArray = palette[change_class]
+    base: FloatArray = np.array([to_rgb(palette[c]) for c in ChangeClass])[change_class]
     if not len(cov):
         return base
     values, axes = np.linalg.eigh(cov)
@@ -267,7 +285,7 @@ def _shaded(cov: FloatArray, change_class: NDArray[np.uint8], sun: FloatArray) -
     return np.asarray(np.clip(lit, 0.0, 1.0))
 
 
-def _add_ellipses(axes: Axes, centre: FloatArray, cov: FloatArray, colours: FloatArray) -> None:
+def add_ellipses(axes: Axes, centre: FloatArray, cov: FloatArray, colours: FloatArray) -> None:
     """Draw N ellipses of covariances (N, 2, 2), the first one lowest."""
     if not len(centre):
         return

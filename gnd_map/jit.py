@@ -31,6 +31,11 @@ def kernels_ready() -> tuple[int, int]:
     return sum(kernel.is_ready for kernel in _KERNELS), len(_KERNELS)
 
 
+def kernel_functions() -> tuple[Callable[..., Any], ...]:
+    """The plain functions of the kernels in the modules that are imported."""
+    return tuple(kernel.plain for kernel in _KERNELS)
+
+
 def _listen() -> None:
     """Register what is to be told with numba, which has just been loaded."""
     from numba.core import event
@@ -62,6 +67,11 @@ class LazyKernel:
         self._dispatcher: Any = None
         if options is not _PASTED:
             _KERNELS.append(self)
+
+    @property
+    def plain(self) -> Callable[..., Any]:
+        """The function as it stands in the source."""
+        return self._function
 
     @property
     def is_ready(self) -> bool:

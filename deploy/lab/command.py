@@ -1,6 +1,5 @@
 """`gnd lab`: a fleet over real shaped links; `check` measures them, `clean` removes what a killed lab left."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import click
 from rich.console import Console
 
 from gnd.deploy.errors import LabError
-from gnd.deploy.fleet_cli import by_part, run, run_options, summary_text
+from gnd.deploy.fleet_cli import by_part, mark_of, run, run_options, summary_text
 from gnd.deploy.fleet_config import load_fleet_config
 from gnd.deploy.interruption import end_on_sigterm
 from gnd.deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
@@ -84,7 +83,7 @@ def lab(
     with open_lab(name, parsed, relay_all=relay_all) as opened:
         folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
         write_settings(config, folder.root)
-        folder.write_mark({"config": dataclasses.asdict(config), "lab": name, "drives": [str(path) for path in drives]})
+        folder.write_mark(mark_of(config, source, lab=name, groups=groups))
         lab_run = LabRun(opened, folder)
         summary = run(config, folder, source, keep_drives=keep_drives, place=lab_run.place)
     if as_json:

@@ -5,7 +5,7 @@ neighbours, at least two voxels). Where vehicles reported them, the store says w
 a report's id holds the time of its drive.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Final, Literal
@@ -150,13 +150,32 @@ def map_changes(
     if not tiles:
         raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
     numbers = versions or (None, None)
-    frame = LocalFrame.of_tile(tiles[len(tiles) // 2])
+    pairs = ((one, old.get(layer, one, numbers[0], old_at_ns), new.get(layer, one, numbers[1])) for one in tiles)
+    return changes_of_tiles(new, layer, pairs, same_store=old is new)
+
+
+def changes_of_tiles(
+    store: Store, layer: str, pairs: Iterable[tuple[TileId, StoredTile | None, StoredTile | None]], *, same_store: bool
+) -> ChangedVoxels:
+    """Object-like changes between two states of tiles.
+
+    Args:
+        store: of the new state; tells which reports made it.
+        layer: a layer of Gaussians.
+        pairs: of each tile the state before and after, None where it is not there.
+        same_store: whether the states before are versions of the same store, so that only later reports count.
+
+    Raises:
+        MissingExtra: scikit-learn is not installed.
+    """
+    held = list(pairs)
+    if not held:
+        return ChangedVoxels((), 0)
+    frame = LocalFrame.of_tile(held[len(held) // 2][0])
     voxels: dict[What, list[_VoxelTable]] = {"new": [], "gone": [], "changed": []}
-    reporters = _Reporters(new, layer)
-    for one in tiles:
-        before = old.get(layer, one, numbers[0], old_at_ns)
-        after = new.get(layer, one, numbers[1])
-        since = before.version if before and old is new else 0
+    reporters = _Reporters(store, layer)
+    for one, before, after in held:
+        since = before.version if before and same_store else 0
         for what, found in _changed(one, before, after, frame, lambda a=after, n=since: reporters.source(a, n)):
             voxels[what].append(found)
     clusters = [cluster for what, found in voxels.items() for cluster in _clusters(what, found, frame)]

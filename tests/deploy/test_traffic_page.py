@@ -3,10 +3,10 @@
 import re
 import shutil
 import subprocess
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from html_reader import Reader
 
 from gnd.deploy.errors import PageError
 from gnd.deploy.traffic_page import page, write_page
@@ -20,7 +20,6 @@ from gnd.gnd_map.tile_id import TileId
 
 TILES = [TileId.from_path(f"13033/03021/23031/2210{digit}") for digit in range(4)]
 LINKS = tuple(load_link(name) for name in ("3g", "4g", "5g"))
-VOID = {"meta", "link", "br", "hr", "img", "input"}
 
 
 def account(folder: Path, name: str = "car-1", links=LINKS, *, driven: bool = True) -> AgentTraffic:
@@ -37,42 +36,6 @@ def account(folder: Path, name: str = "car-1", links=LINKS, *, driven: bool = Tr
     file = folder / f"{len(list(folder.iterdir()))}.jsonl"
     ledger.write_jsonl(file)
     return agent_traffic(read_ledger(file), links)
-
-
-class Reader(HTMLParser):
-    """Checks that tags are balanced and keeps tags with attributes, and text."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text: list[str] = []
-        self.feed(text)
-        self.close()
-        assert self.open == [], f"not closed: {self.open}"
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open, f"</{tag}> closes nothing"
-        assert self.open.pop() == tag, f"</{tag}> at {self.getpos()}"
-
-    def handle_data(self, data):
-        if self.open[-1:] != ["style"]:
-            self.text.append(data)
-
-    def count(self, tag: str) -> int:
-        return sum(1 for found, _ in self.tags if found == tag)
-
-    @property
-    def words(self) -> str:
-        return " ".join(" ".join(self.text).split())
 
 
 def test_the_page_holds_the_figures_of_the_account(tmp_path):
