@@ -12,6 +12,7 @@ import click
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.merger import run_shard
 from gnd.cloud_merger.statements import Mode
+from gnd.ending import orderly
 from gnd.fleet_bus.health_options import metrics_options
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.settings_file import load_settings
@@ -66,9 +67,10 @@ def merger(
     click.echo(f"merger {config.shard_id}: store {shown(config.store_path)}, mode {config.merge.mode}", err=True)
     metrics_at = None if metrics_port is None else (metrics_host, metrics_port)
     wait_for_store(config.store_path, wait_s, stop)
-    if follow:
-        run_following(
-            config.store_path, lambda at, ended: run_shard(replace(config, store_path=at), ended, metrics_at), stop
-        )
-    elif not stop.is_set():
-        run_shard(config, stop, metrics_at)
+    with orderly():
+        if follow:
+            run_following(
+                config.store_path, lambda at, ended: run_shard(replace(config, store_path=at), ended, metrics_at), stop
+            )
+        elif not stop.is_set():
+            run_shard(config, stop, metrics_at)

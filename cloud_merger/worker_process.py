@@ -5,7 +5,7 @@ something has come, and its end when that process has ended, however it did. Its
 to tell how far his report has come. The process that receives tells it, for it has agreed on keys with the vehicles.
 """
 
-from gnd.ending import run_program  # isort: skip  # registers its end before others do
+from gnd.ending import ctrl_c_withheld, run_program  # isort: skip  # registers its end before others do
 
 import contextlib
 import io
@@ -45,9 +45,10 @@ class WorkerProcess:
     def _start(self) -> "subprocess.Popen[bytes]":
         self._started_s = time.monotonic()
         command = [sys.executable, "-m", __name__]
-        process = subprocess.Popen(  # noqa: S603 - nothing in it is given
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
-        )
+        with ctrl_c_withheld():  # the line to it is its end
+            process = subprocess.Popen(  # noqa: S603 - nothing in it is given
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
+            )
         threading.Thread(target=self._hear, args=(process,), name="line back", daemon=True).start()
         if process.stdin is not None:
             process.stdin.write(len(self._config).to_bytes(8, "little") + self._config)

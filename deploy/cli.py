@@ -1,6 +1,9 @@
 """The command `gnd`: one table of subcommands, each loaded when it is called."""
 
-from gnd.ending import run_program  # isort: skip  # registers its end before others do
+from gnd.ending import catch_signals, ending_at_once, exit_code, run_program, working  # isort: skip  # before others
+
+if __name__ == "__main__":  # `python -m gnd.deploy.cli`: before the heavy imports
+    catch_signals()
 
 import importlib
 import os
@@ -84,7 +87,7 @@ class LazyGroup(click.Group):
         if cmd_name not in self._table:
             return None
         module, attribute = self._table[cmd_name][0].split(":")
-        with explained():
+        with explained(), ending_at_once():
             command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
 
@@ -108,7 +111,7 @@ def main() -> None:
     """Run the command line; every error of ours becomes one line on standard error and exit code 2."""
     tell_compiling(say_progress())
     try:
-        with explained():
+        with explained(), working():
             gnd.main(standalone_mode=False)
     except click.ClickException as error:
         error.show()
@@ -118,16 +121,11 @@ def main() -> None:
         sys.exit(2)
     except (KeyboardInterrupt, click.Abort):
         click.echo("gnd: interrupted", err=True)
-        sys.exit(130)
+        sys.exit(exit_code())
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
 
 
-def program() -> None:
-    """The command `gnd` as a process of its own."""
-    run_program(main)
-
-
 if __name__ == "__main__":
-    program()
+    run_program(main)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from gnd.deploy.report.software import software
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from gnd.deploy.site import SiteFrame
 from gnd.deploy.source import Source
+from gnd.ending import orderly
 from gnd.extras import need_all
 from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.settings_file import write_settings
@@ -209,14 +209,15 @@ def run(
     from gnd.tile_store.sqlite_store import SqliteStore
 
     console = Console(stderr=True)
-    stop, started_s = _stop_on_sigterm(), time.monotonic()
+    started_s = time.monotonic()
     with progress_bars(console) as progress:
         compiling = progress.add_task("compiling kernels for this machine (once)", visible=False, total=None)
 
         def show(ready: int, known: int) -> None:
             progress.update(compiling, visible=True, completed=ready, total=known)
 
-        warm = threading.Thread(target=start_fork_server, name="fork-server")
+        # A daemon: who ends the command meanwhile does not wait until kernels are compiled.
+        warm = threading.Thread(target=start_fork_server, name="fork-server", daemon=True)
         with watched_elsewhere(show):
             warm.start()  # the kernels are loaded while the world is made
             prepared = prepare.prepare(config, folder, source, progress)
@@ -228,18 +229,12 @@ def run(
         with SqliteStore(folder.store, signing=Signing(identities / "fleet")) as store:
             sign_unsigned(store)  # the base map: without that no vehicle would take it
     prepare_s = time.monotonic() - started_s
-    with place() as site:
-        outcome = run_fleet(config, folder, prepared, console, stop, site)
+    with orderly(), place() as site:
+        outcome = run_fleet(config, folder, prepared, console, threading.Event(), site)
     result = summary.write_summary(config, folder, prepared, outcome, prepare_s)
     if not keep_drives:
         prepare.remove_drives(folder)
     return result
-
-
-def _stop_on_sigterm() -> threading.Event:
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    return stop
 
 
 def summary_text(summary: dict[str, Any], folder: RunFolder) -> str:

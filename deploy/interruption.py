@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from gnd.ending import orderly
+
 
 @contextmanager
 def ending_in_order() -> Iterator[threading.Event]:
@@ -19,16 +21,8 @@ def ending_in_order() -> Iterator[threading.Event]:
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield stop
+        with orderly():
+            yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def end_on_sigterm() -> None:
-    """Make SIGTERM end the command as Ctrl-C does."""
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, end)

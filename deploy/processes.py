@@ -22,6 +22,7 @@ from typing import Any, Final
 
 from gnd.deploy.errors import ProcessDied
 from gnd.deploy.lab.namespaces import enter_namespace
+from gnd.ending import ctrl_c_withheld
 from gnd.fleet_bus.config import PLAIN_VARIABLE
 from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE
 
@@ -196,7 +197,8 @@ def start_fork_server() -> None:
     """
     _context.set_forkserver_preload(list(PRELOAD))
     probe = _context.Process(target=_nothing, name="warm-up")
-    probe.start()
+    with ctrl_c_withheld():  # it may come while kernels are compiled; who started the fork server ends it
+        probe.start()
     probe.join()
 
 

@@ -9,6 +9,7 @@ from typing import Final
 
 from rich.progress import Progress
 
+from gnd.ending import ctrl_c_withheld
 from gnd.fleet_sim.camera import SignCamera
 from gnd.fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, simulate_drive
 from gnd.fleet_sim.errors import SimError
@@ -160,8 +161,10 @@ def _run(
     """
     task = progress.add_task("simulating", total=len(jobs)) if progress else None
     context = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(max(1, min(processes, len(jobs))), mp_context=context) as pool:
-        futures: list[Future[object]] = [pool.submit(function, *arguments) for function, arguments in jobs]
+        with ctrl_c_withheld():  # this process ends them
+            futures: list[Future[object]] = [pool.submit(function, *arguments) for function, arguments in jobs]
         try:
             for future in as_completed(futures):
                 future.result()
@@ -169,4 +172,6 @@ def _run(
                     progress.advance(task)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()  # what it computes nobody wants any more: do not wait for it
             raise

@@ -25,6 +25,7 @@ NAMES: Final = (
     "signatures",
     "identity-bytes",
     "many-tiles",
+    "endings",
 )
 
 

@@ -13,6 +13,7 @@ from types import FrameType
 import click
 from prometheus_client import CollectorRegistry
 
+from gnd.ending import orderly
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.certificate_metrics import certificate_checks, register_certificate
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
@@ -108,10 +109,11 @@ def store(
         _serve(replace(server, path=location), metrics_at, ended)
 
     wait_for_store(server.path, wait_s, stop)
-    if follow:
-        run_following(server.path, serve, stop)
-    elif not stop.is_set():
-        serve(server.path, stop)
+    with orderly():
+        if follow:
+            run_following(server.path, serve, stop)
+        elif not stop.is_set():
+            serve(server.path, stop)
     click.echo("tile server ended")
 
 

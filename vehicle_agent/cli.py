@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from gnd.ending import orderly
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.identity.options import identity_option
@@ -87,7 +88,8 @@ def agent(
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    click.echo(summary_line(run_agent(config, stop)))
+    with orderly():
+        click.echo(summary_line(run_agent(config, stop)))
 
 
 def _under_pseudonym(config: "AgentConfig") -> "AgentConfig":

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from gnd.deploy.doctor.finding import Finding
+from gnd.deploy.doctor.finding import Finding, State
 from gnd.fleet_bus.build_info import BUILD, CLOCK, build_info
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig, zenoh_config
@@ -181,5 +181,5 @@ def _clock(what: str, told: tuple[dict[str, Any], float] | None, asked_s: float,
     says = f"its clock is off by {off_s:+.2f} s (the answer took {1000 * (answered_s - asked_s):.0f} ms)"
     if abs(off_s) <= _OFF_S[0]:
         return Finding(what, "ok", says)
-    state = "warning" if abs(off_s) <= _OFF_S[1] else "fault"
+    state: State = "warning" if abs(off_s) <= _OFF_S[1] else "fault"
     return Finding(what, state, says, "set both clocks by NTP: certificates and times of reports depend on them")

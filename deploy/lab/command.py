@@ -10,7 +10,6 @@ from rich.console import Console
 from gnd.deploy.errors import LabError
 from gnd.deploy.fleet_cli import by_part, mark_of, run, run_options, summary_text
 from gnd.deploy.fleet_config import load_fleet_config
-from gnd.deploy.interruption import end_on_sigterm
 from gnd.deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
 from gnd.deploy.lab.check import as_json as check_as_json
 from gnd.deploy.lab.groups import DEFAULT_GROUPS, parse_groups
@@ -22,6 +21,7 @@ from gnd.deploy.lab.tables import check_table, run_table, run_verdict
 from gnd.deploy.lab.tools import check_rights
 from gnd.deploy.run_folder import create_run_folder, default_run_path
 from gnd.deploy.source import Source
+from gnd.ending import orderly
 from gnd.extras import need_all
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.gnd_map.settings import settings_text
@@ -79,8 +79,7 @@ def lab(
     need_all()
     source = Source(drives, base_map, worlds, config.agents)
     check_rights()
-    end_on_sigterm()
-    with open_lab(name, parsed, relay_all=relay_all) as opened:
+    with orderly(), open_lab(name, parsed, relay_all=relay_all) as opened:
         folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
         write_settings(config, folder.root)
         folder.write_mark(mark_of(config, source, lab=name, groups=groups))
@@ -124,8 +123,7 @@ def check(links: str, name: str, relay_all: bool, seconds: float, as_json_: bool
     """Measure rate, delay and loss of each profile by real transfers through a shaped link."""
     groups = parse_groups(",".join(f"{link}:1" for link in links.split(",") if link.strip()))
     check_rights()
-    end_on_sigterm()
-    with open_lab(name, groups, relay_all=relay_all) as opened, carried(opened):
+    with orderly(), open_lab(name, groups, relay_all=relay_all) as opened, carried(opened):
         measured = [measure(link, direction, seconds) for link in opened.links for direction in DIRECTIONS]
     if as_json_:
         click.echo(json.dumps(check_as_json(measured), indent=2))

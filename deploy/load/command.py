@@ -19,6 +19,7 @@ from gnd.deploy.load.making import kept_runs
 from gnd.deploy.load.plan import LoadOptions
 from gnd.deploy.load.run import Tell, run_load
 from gnd.deploy.load.verdict import summary
+from gnd.ending import exit_code
 from gnd.extras import need_all
 from gnd.tile_store.location import LOCATION, StoreLocation
 
@@ -92,7 +93,7 @@ def load(
     if str(json_file) != "-":
         Console(width=110).print(table_of(figures))
     if figures["why_not"] == ["the run was interrupted"]:
-        sys.exit(130)
+        sys.exit(exit_code())
 
 
 def table_of(figures: dict[str, Any]) -> Table:

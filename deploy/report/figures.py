@@ -8,7 +8,7 @@ import numpy as np
 from gnd.deploy.html_page import picture, text_table
 from gnd.deploy.report.finished_run import FinishedRun
 from gnd.deploy.report.pictures import errors_picture
-from gnd.fleet_sim.evaluate import CLASSES, Score, evaluate_maps
+from gnd.fleet_sim.evaluate import CLASSES, Evaluation, Score, evaluate_maps
 from gnd.fleet_sim.truth import LEVELS
 from gnd.gnd_map.arrays import F64
 
@@ -23,33 +23,43 @@ _MEANT: Final = {
 
 def against_truth(run: FinishedRun) -> str:
     """F1 by level and stage, and the confusion of the leading level; says so where there is no truth."""
-    f1 = run.summary.get("f1")
-    if not isinstance(f1, dict) or not isinstance(f1.get("levels"), dict):
+    told = run.summary.get("f1")
+    levels = told.get("levels") if isinstance(told, dict) else None
+    stages = levels if isinstance(levels, dict) else {}
+    after = None
+    if run.truth is not None:
+        base, final = ({one.tile.tile: getattr(one, state) for one in run.tiles} for state in ("before", "after"))
+        before, after = evaluate_maps(run.truth, base, base), evaluate_maps(run.truth, base, final)
+        own = {level: {"before": before.f1(level), "after": after.f1(level)} for level in LEVELS}
+        stages = {level: _stage_values(stages.get(level)) | own[level] for level in LEVELS}
+    if not stages:
         return '<p class="note">There is no truth: real drives, or a run that did not end. So there is no F1.</p>'
-    rows = [(level, *_stages(f1["levels"].get(level)), _MEANT[level]) for level in LEVELS]
+    rows = [(level, *_stages(stages.get(level)), _MEANT[level]) for level in LEVELS]
     table = text_table(("voxels", "before", "one vehicle alone", "after", "which"), rows)
     text = (
         "<p>Macro F1 in percent: the mean over the classes normal, new, modified, deleted and empty. "
         "<b>Observable</b> voxels lead. One vehicle alone: the mean over vehicles that drove on the map before.</p>"
     )
-    return text + table + _confusion(run)
+    return text + table + _confusion(after)
 
 
 def _stages(stages: Any) -> tuple[str, ...]:
-    found = stages if isinstance(stages, dict) else {}
+    found = _stage_values(stages)
     return tuple(_percent(found.get(name)) for name in ("before", "single", "after"))
+
+
+def _stage_values(stages: Any) -> dict[str, Any]:
+    return dict(stages) if isinstance(stages, dict) else {}
 
 
 def _percent(value: Any) -> str:
     return f"{value:.1f} %" if isinstance(value, int | float) else "–"
 
 
-def _confusion(run: FinishedRun) -> str:
-    if run.truth is None:
+def _confusion(after: Evaluation | None) -> str:
+    if after is None:
         return '<p class="note">The truth is not at hand, so there is no confusion matrix.</p>'
-    base = {one.tile.tile: one.before for one in run.tiles}
-    final = {one.tile.tile: one.after for one in run.tiles}
-    score = evaluate_maps(run.truth, base, final).scores["observable"]
+    score = after.scores["observable"]
     text = "<p>Observable voxels of the map after the run: rows are what is true, columns what the map says.</p>"
     return text + _matrix(score) + _of_classes(score)
 
@@ -74,6 +84,8 @@ def _of_classes(score: Score) -> str:
 def localisation(run: FinishedRun) -> str:
     """Errors against the reference of the recordings, a row a vehicle, and over time."""
     known = [(one["vehicle"], found) for one in run.results if (found := _errors_of(one)) is not None]
+    if not run.results:
+        return '<p class="note">No vehicle left a result.</p>'
     if not known:
         return '<p class="note">The recordings hold no reference poses: errors of localisation are not known.</p>'
     rows = [(name, str(len(along)), *_quantiles(along, across, turn)) for name, (_, along, across, turn) in known]
@@ -81,7 +93,7 @@ def localisation(run: FinishedRun) -> str:
     if len(known) > 1:
         rows.append(("all", str(len(every[0])), *_quantiles(*every)))
     header = ("vehicle", "scans", "along, 95 %", "largest", "across, 95 %", "largest", "heading, 95 %", "largest")
-    curves = errors_picture([(name, *found) for name, found in known])
+    curves = errors_picture([found[:3] for _, found in known])
     return text_table(header, rows) + picture(curves, "Errors of all vehicles along their drives")
 
 

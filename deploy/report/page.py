@@ -22,15 +22,16 @@ _MOST_TILES: Final = 300
 _MORE_STYLE: Final = """
 figure img{display:block;width:100%;max-width:60rem;height:auto;border-radius:.5rem;background:#fff}
 h3{font-size:1rem;margin:1.2rem 0 .1rem}
-.change figure img{max-width:46rem}.change figcaption{display:none}
+.change figure img{max-width:46rem}.change figcaption,.maps figcaption{display:none}
+.maps figure{margin:0 0 1rem}
 ul.said{padding-left:1.2rem}ul.said li{margin:.2rem 0}
 ul.warn{margin:.5rem 0;padding:0;list-style:none}
 ul.warn li{border-left:.3rem solid #d55e00;background:var(--card);padding:.5rem .8rem;margin:.4rem 0;
 border-radius:.3rem;overflow-wrap:anywhere}
 pre{background:var(--card);padding:.7rem .8rem;border-radius:.5rem;overflow-x:auto;font-size:.85rem}
-nav a{color:var(--ink);margin-right:.8rem;white-space:nowrap}
+nav{margin:1rem 0;line-height:1.9}nav a{color:var(--ink);margin-right:.6rem;white-space:nowrap}
 p.key i{border:1px solid var(--soft)}
-td.t{white-space:normal;overflow-wrap:anywhere}
+td.t{white-space:normal;overflow-wrap:anywhere}code{overflow-wrap:anywhere;font-size:.85rem}
 @media print{:root{--paper:#fff;--ink:#000;--soft:#444;--rule:#bbb;--card:#f2f4f5;--down:#1f7a4d;--up:#7a4fb0;
 --extra:#b9c2c9;--l0:#2a6fbb;--l1:#c8641a;--l2:#a98600;--l3:#8a3ffc;--l4:#007d79;--tile:#1f7a4d;color-scheme:light}
 body{font-size:11px}main{max-width:none;padding:0}nav{display:none}
@@ -51,7 +52,7 @@ def report_page(run: FinishedRun, pictures: int = 24) -> str:
     title = f"Report of {escape(run.name)}"
     states = map_states(run)
     parts = list(_parts(run, states, pictures))
-    links = "".join(f'<a href="#{anchor}">{name}</a>' for anchor, name, _ in parts)
+    links = " ".join(f'<a href="#{anchor}">{name}</a>' for anchor, name, _ in parts)
     body = (
         f"<header><h1>{title}</h1><p>{escape(_subtitle(run))}</p></header>",
         _missing(run.missing),
@@ -87,7 +88,7 @@ def _parts(run: FinishedRun, states: MapStates | None, pictures: int) -> Iterato
 
 def _subtitle(run: FinishedRun) -> str:
     drives = run.mark.get("drives")
-    count = len(run.results)
+    count = max(len(run.results), len(run.traffic))
     vehicles = "1 vehicle" if count == 1 else f"{count} vehicles"
     what = "recorded drives" if isinstance(drives, list) and drives else "a simulated street"
     km = sum(one.drive_km for one in run.traffic)
@@ -134,7 +135,8 @@ def _maps(states: MapStates | None) -> str:
     if states is None:
         return '<p class="note">The map has no tiles.</p>'
     key = f"<p>Each ellipsoid is one voxel. {escape('; '.join(classes_in_words()))}.</p>"
-    return key + "".join(picture(png, caption) for caption, png in map_pictures(states))
+    pictures = "".join(picture(png, caption) for caption, png in map_pictures(states))
+    return f'{key}<div class="maps">{pictures}</div>'
 
 
 def _traffic(run: FinishedRun) -> str:

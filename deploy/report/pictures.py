@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from gnd.deploy.map_export.changes import Change
 from gnd.deploy.report.colours import SAFE_COLOURS
@@ -28,6 +29,7 @@ _ELEVATION_RAD: Final = np.radians(38.0)
 _SUN: Final = np.array([-0.35, -0.5, 0.79])
 _INK: Final = "#1c2430"
 _EDGE: Final = "#c3ccd8"
+_HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,20 +154,20 @@ def _scale(axes: Axes, half_m: float) -> None:
     length = next((one for one in (20.0, 10.0, 5.0) if one < 0.8 * half_m), 2.0)
     x, y = -0.93 * half_m, -0.93 * half_m
     axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.0, solid_capstyle="butt")
-    place: dict[str, Any] = {"ha": "left", "va": "bottom", "fontsize": 7, "color": _INK}
+    place: dict[str, Any] = {"ha": "left", "va": "bottom", "fontsize": 7, "color": _INK, "path_effects": _HALO}
     axes.text(x, y + 0.03 * half_m, f"{length:g} m", **place)
 
 
-def errors_picture(vehicles: Sequence[tuple[str, F64, F64, F64]]) -> bytes:
+def errors_picture(vehicles: Sequence[tuple[F64, F64, F64]]) -> bytes:
     """Errors along and across the way over time, a curve a vehicle.
 
     Args:
-        vehicles: name, time of the drive (N,) s, error along (N,) m, error across (N,) m.
+        vehicles: time of the drive (N,) s, error along (N,) m, error across (N,) m.
     """
     figure = Figure(figsize=(9.0, 3.6), dpi=_MAP_DPI, facecolor="white", layout="constrained")
     for row, label in enumerate(("along, cm", "across, cm")):
         axes = figure.add_subplot(2, 1, row + 1)
-        for _, t_s, *errors in vehicles:
+        for t_s, *errors in vehicles:
             axes.plot(t_s, 100 * errors[row], linewidth=0.8, color="#0072b2", alpha=0.6)
         axes.set_ylabel(label, color=_INK, fontsize=9)
         axes.grid(color="#e3e7ed", linewidth=0.8)

@@ -33,9 +33,10 @@ def work_list(run: FinishedRun, states: MapStates | None, pictures: int) -> str:
 def _said(found: ChangedVoxels, pictures: int) -> str:
     counts = {what: sum(one.change == what for one in found.changes) for what in _WORDS}
     told = ", ".join(f"{count} {_WORDS[what]}" for what, count in counts.items() if count)
+    noun = "1 change" if len(found.changes) == 1 else f"{len(found.changes)} changes"
     which = "each with a picture" if pictures == len(found.changes) else f"the {pictures} largest with a picture"
     return (
-        f"{len(found.changes)} changes ({told}), {which}. Voxels that touch are one change; what is new, gone and of "
+        f"{noun} ({told}), {which}. Voxels that touch are one change; what is new, gone and of "
         f"another shape is told apart. {_alone(found)}"
     )
 

@@ -15,6 +15,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gnd.ending import ENDING_SIGNALS, exit_code, orderly
 from gnd.tile_store.arguments import parse_time_ns
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
@@ -25,8 +26,6 @@ from gnd.vehicle_agent.localise_drive.outputs import FORMATS, make_folder, write
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, check_is_drive, localise_drive
 from gnd.vehicle_agent.localise_drive.stretches import stretches_of
 from gnd.vehicle_agent.localise_drive.tiles import StoreMap
-
-INTERRUPTED = 130
 
 
 @click.command(name="localise")
@@ -102,19 +101,25 @@ def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def ended_by_ctrl_c() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second ends the program as always."""
+    """An event that the first Ctrl-C or SIGTERM sets; the second ends the program as always."""
     stop = threading.Event()
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in ENDING_SIGNALS}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     def end(_number: int, _frame: FrameType | None) -> None:
         stop.set()
-        signal.signal(signal.SIGINT, before)
+        restore()
 
-    signal.signal(signal.SIGINT, end)
+    for number in ENDING_SIGNALS:
+        signal.signal(number, end)
     try:
-        yield stop
+        with orderly():
+            yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
 
 
 def _tell(found: LocalisedDrive, values: dict[str, Any], json_to: str | None) -> None:
@@ -139,4 +144,4 @@ def _end(found: LocalisedDrive, folder: Path, *, interrupted: bool) -> None:
         raise LocaliseError(f"{found.counts.damage}; {folder} holds what came before ({found.counts.scans} scans)")
     if interrupted:
         click.echo(f"gnd: interrupted; {folder} holds the first {found.counts.scans} scans", err=True)
-        sys.exit(INTERRUPTED)
+        sys.exit(exit_code())
