@@ -127,5 +127,11 @@ def main() -> None:
         sys.exit(0)
 
 
+def program() -> None:
+    """The command as installations from before `gnd.program` call it."""
+    catch_signals()
+    run_program(main)
+
+
 if __name__ == "__main__":
     run_program(main)

@@ -29,6 +29,8 @@ GRACE_S: Final = 2.5
 ORDERLY_S: Final = 25.0
 """One that has (`orderly`) is killed so long after it; it is meant to need a second."""
 _FAILED: Final = 1
+_COMPILER: Final = "llvmlite"
+_AGAIN_S: Final = 0.02
 _TRACKER: Final = b"resource_tracker"
 """A helper of multiprocessing that cleans up after others, and ends by itself."""
 
@@ -124,12 +126,25 @@ def run_program(main: Callable[[], None]) -> None:
         _exit_now(0)
 
 
-def _end(number: int, _frame: FrameType | None) -> None:
+def _end(number: int, frame: FrameType | None) -> None:
     _note(number)
     if _at_once[0]:
         _say_interrupted()
         _exit_now(exit_code())
+    if _is_called_by_compiler(frame):  # which would print the exception, and go on
+        signal.signal(signal.SIGALRM, lambda _number, later: _end(number, later))
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        return
     raise KeyboardInterrupt
+
+
+def _is_called_by_compiler(frame: FrameType | None) -> bool:
+    """Whether the interrupted function was called by LLVM, of which exceptions do not come back."""
+    while frame is not None:
+        if _COMPILER in frame.f_code.co_filename and frame.f_code.co_name.startswith("_raw_"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _note(number: int) -> None:
