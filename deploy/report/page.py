@@ -38,7 +38,7 @@ body{font-size:11px}main{max-width:none;padding:0}nav{display:none}
 h2,h3{break-after:avoid}.change,figure,tr,.cards{break-inside:avoid}
 details::details-content{content-visibility:visible;display:block;height:auto}
 .wide{overflow:visible}table{font-size:9px}th,td{white-space:normal;padding-right:.4rem}
-pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:9px}}
+pre{white-space:pre-wrap;overflow-wrap:anywhere}pre,code,dd,dt,.note,.key{font-size:9px}}
 """
 
 
