@@ -21,7 +21,7 @@ from gnd.deploy.report.software import software
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from gnd.deploy.site import SiteFrame
 from gnd.deploy.source import Source
-from gnd.ending import orderly
+from gnd.ending import ending_at_once, orderly
 from gnd.extras import need_all
 from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.settings_file import write_settings
@@ -199,14 +199,15 @@ def run(
         The content of `summary.json`.
     """
     # The heavy imports wait until the options have been found good.
-    from gnd.deploy import prepare, summary
-    from gnd.deploy.compiling import watched_elsewhere
-    from gnd.deploy.fleet import run_fleet
-    from gnd.deploy.live import progress_bars
-    from gnd.deploy.processes import start_fork_server
-    from gnd.tile_store.signatures import sign_unsigned
-    from gnd.tile_store.signing import Signing
-    from gnd.tile_store.sqlite_store import SqliteStore
+    with ending_at_once():
+        from gnd.deploy import prepare, summary
+        from gnd.deploy.compiling import watched_elsewhere
+        from gnd.deploy.fleet import run_fleet
+        from gnd.deploy.live import progress_bars
+        from gnd.deploy.processes import start_fork_server
+        from gnd.tile_store.signatures import sign_unsigned
+        from gnd.tile_store.signing import Signing
+        from gnd.tile_store.sqlite_store import SqliteStore
 
     console = Console(stderr=True)
     started_s = time.monotonic()

@@ -15,7 +15,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, Final
@@ -197,6 +197,7 @@ def start_fork_server() -> None:
     """
     _context.set_forkserver_preload(list(PRELOAD))
     probe = _context.Process(target=_nothing, name="warm-up")
+    resource_tracker.ensure_running()  # where it starts this itself, it lets Ctrl-C through again
     with ctrl_c_withheld():  # it may come while kernels are compiled; who started the fork server ends it
         probe.start()
     probe.join()

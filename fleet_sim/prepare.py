@@ -4,6 +4,7 @@ import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Final
 
@@ -163,6 +164,7 @@ def _run(
     context = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(max(1, min(processes, len(jobs))), mp_context=context) as pool:
+        resource_tracker.ensure_running()  # where the pool starts this itself, it lets Ctrl-C through again
         with ctrl_c_withheld():  # this process ends them
             futures: list[Future[object]] = [pool.submit(function, *arguments) for function, arguments in jobs]
         try:

@@ -131,7 +131,7 @@ class Ending:
         expected = (128 + self.signal, *self.case.codes, *((0,) if self.by_itself else ()))
         if self.code not in expected:
             found.append(f"exit code {self.code}, not one of {expected}")
-        if re.search(r"Traceback|Exception ignored|^KeyboardInterrupt|FATAL|core dumped", self.said, re.M):
+        if re.search(r"Traceback|Exception ignored|Warning: |^KeyboardInterrupt|FATAL|core dumped", self.said, re.M):
             found.append("a traceback")
         if self.left:
             found.append(f"left behind: {'; '.join(self.left)}")

@@ -5,7 +5,8 @@ and the whole process aborts with "FATAL: exception not rethrown" and status -6 
 of ours is not taken down: when its threads have ended and what others registered for the end has run, it exits.
 
 Signals (decision 177). Until a command works, a signal ends the process at once: nothing is to be put in order. Then it
-raises KeyboardInterrupt, unless the command has a handler of its own. A thread watches beside: where the end takes
+raises KeyboardInterrupt (a moment later where an import or a compiler is interrupted, which would swallow it), unless
+the command has a handler of its own. A thread watches beside: where the end takes
 longer than the grace, or at the second signal, what is left of the program and its helpers is killed. Its exit code is
 130 after Ctrl-C and 143 after SIGTERM.
 
@@ -30,6 +31,7 @@ ORDERLY_S: Final = 25.0
 """One that has (`orderly`) is killed so long after it; it is meant to need a second."""
 _FAILED: Final = 1
 _COMPILER: Final = "llvmlite"
+_IMPORTING: Final = "<frozen importlib"
 _AGAIN_S: Final = 0.02
 _TRACKER: Final = b"resource_tracker"
 """A helper of multiprocessing that cleans up after others, and ends by itself."""
@@ -72,8 +74,10 @@ def orderly() -> Iterator[None]:
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """A signal within the block ends the process without more ado: while modules are imported."""
-    before, _at_once[0] = _at_once[0], True
+    """A signal within the block ends the process without more ado: while modules are imported. Not where there is
+    something to put in order.
+    """
+    before, _at_once[0] = _at_once[0], _grace_s[0] != ORDERLY_S
     try:
         yield
     finally:
@@ -114,16 +118,17 @@ def run_program(main: Callable[[], None]) -> None:
         main()
     except SystemExit as end:
         _status = _number_of(end.code)
-        if _signalled:
-            _exit_now(_status)
-        raise
+        if not _signalled:
+            raise
     except KeyboardInterrupt:
-        if _signalled:
-            _exit_now(exit_code())
-        raise
-    _status = 0
-    if _signalled:
-        _exit_now(0)
+        _status = exit_code()
+        if not _signalled:
+            raise
+    else:
+        _status = 0
+    if _signalled:  # as at the end of the interpreter, but nobody waits for threads
+        kill_descendants()
+        atexit._run_exitfuncs()
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -131,17 +136,21 @@ def _end(number: int, frame: FrameType | None) -> None:
     if _at_once[0]:
         _say_interrupted()
         _exit_now(exit_code())
-    if _is_called_by_compiler(frame):  # which would print the exception, and go on
+    if _must_not_raise(frame):
         signal.signal(signal.SIGALRM, lambda _number, later: _end(number, later))
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
         return
     raise KeyboardInterrupt
 
 
-def _is_called_by_compiler(frame: FrameType | None) -> bool:
-    """Whether the interrupted function was called by LLVM, of which exceptions do not come back."""
+def _must_not_raise(frame: FrameType | None) -> bool:
+    """Whether an exception would be lost or changed where the program was interrupted.
+
+    Functions that LLVM calls give none back. A module in C++ that is being imported makes an ImportError of it.
+    """
     while frame is not None:
-        if _COMPILER in frame.f_code.co_filename and frame.f_code.co_name.startswith("_raw_"):
+        code = frame.f_code
+        if code.co_filename.startswith(_IMPORTING) or (_COMPILER in code.co_filename and code.co_name[:5] == "_raw_"):
             return True
         frame = frame.f_back
     return False

@@ -199,3 +199,22 @@ def test_processes_started_while_ctrl_c_is_withheld_never_get_it():
     )
     written, errors = process.communicate(timeout=30)
     assert (process.returncode, written, errors) == (0, "1\n", "")
+
+
+def test_an_exception_comes_after_an_import_that_would_swallow_it(tmp_path):
+    (tmp_path / "swallows.py").write_text(
+        "import time\nprint('ready', flush=True)\nend_s = time.monotonic() + 1.0\n"
+        "try:\n    while time.monotonic() < end_s:\n        pass\n"
+        "except BaseException as error:\n    raise ImportError('initialization failed') from error\n"
+    )
+    process = signalled(f"sys.path.insert(0, {str(tmp_path)!r}); import swallows; time.sleep(60)")
+    process.send_signal(signal.SIGINT)
+    written, errors = process.communicate(timeout=30)
+    assert (process.returncode, written, errors) == (130, "closed\n", "")
+
+
+def test_what_is_to_be_put_in_order_is_while_modules_are_imported_too():
+    process = signalled("with ending.orderly(), ending.ending_at_once(): ready(); time.sleep(60)")
+    process.send_signal(signal.SIGTERM)
+    written, errors = process.communicate(timeout=30)
+    assert (process.returncode, written, errors) == (143, "closed\n", "")
