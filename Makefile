@@ -10,7 +10,7 @@ SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs extras bench studies schemas lock sbom audit clean
+.PHONY: help setup fleet test quick check docs extras bench studies schemas page lock sbom audit clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -64,6 +64,13 @@ studies: setup   ## print the studies' small benchmarks with their commands: mak
 
 schemas: setup   ## generate Python from schemas/*.proto
 	$(BIN)/python -m gnd.schemas.generate
+
+page/node_modules/.ready: page/package-lock.json
+	cd page && npm ci --ignore-scripts --no-audit --no-fund
+	@touch $@
+
+page: page/node_modules/.ready  ## build the page of gnd serve from page/ (needs node 20): deploy/serve/page
+	cd page && npm run --silent check-types && npm run --silent build
 
 TOOLS := build/tools
 $(TOOLS)/.ready:

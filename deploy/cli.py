@@ -27,6 +27,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "chaos": ("gnd.deploy.chaos_cli:chaos", "Inject faults into a whole cloud, and check its guarantees."),
     "watch": ("gnd.deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
+    "serve": ("gnd.deploy.serve.command:serve", "Show a map in the browser: as it is, as it was, as it changes."),
     "traffic": (
         "gnd.deploy.traffic_cli:traffic",
         "Every byte of a run, compared with 3G, 4G and 5G; also as a page.",

@@ -8,6 +8,8 @@ GndError
     │   └── LabRuns        a lab of that name is running
     ├── PageError          a page cannot be written
     ├── ReportError        a run cannot be reported
+    ├── ServeError         a map cannot be shown in the browser
+    ├── BadQuestion        a browser asks for what there is not
     ├── ChaosError         a chaos run cannot start, or its street cannot be read
     ├── LoadError          a load cannot be made
     └── NoStudies          the papers' results can be reproduced in a checkout only
@@ -42,6 +44,14 @@ class PageError(DeployError):
 
 class ReportError(DeployError):
     """A run cannot be reported: it is none, its map is missing, or there is no browser that prints."""
+
+
+class ServeError(DeployError):
+    """A map cannot be shown in the browser: an address that others reach without a token, a page that is missing."""
+
+
+class BadQuestion(DeployError):
+    """A browser asks for what there is not, or for too much."""
 
 
 class ChaosError(DeployError):

@@ -93,6 +93,7 @@ def run_fleet(
     started_s = time.monotonic()
     config = for_drives(config, prepared)
     site = site or loopback_site(config, len(prepared.agent_drives), prepared.identities)
+    folder.endpoint.write_text(f"{site.connect}\n", encoding="utf-8")
     links = {vehicle_name(n): load_link(place.link) for n, place in enumerate(site.vehicles)}
     state = FleetState(links=links, ledgers=LiveLedgers(folder.root))
     with ExitStack() as stack:

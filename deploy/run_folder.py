@@ -82,6 +82,11 @@ class RunFolder:
         return self.root / "pids.json"
 
     @property
+    def endpoint(self) -> Path:
+        """The endpoint of the run's router, for who wants to follow it."""
+        return self.root / "endpoint.txt"
+
+    @property
     def mark(self) -> Path:
         """The file that says that this folder is a run, with its effective configuration."""
         return self.root / MARK

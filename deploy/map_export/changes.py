@@ -127,7 +127,7 @@ class _VoxelTable:
 
 def map_changes(
     old: Store, new: Store, *, layer: str, prefix: str = "", old_at_ns: int | None = None, tile: TileId | None = None,
-    versions: tuple[int, int] | None = None,
+    versions: tuple[int, int] | None = None, only: Sequence[TileId] | None = None,
 ) -> ChangedVoxels:  # fmt: skip
     """Object-like changes of a region between two stores, two times of one store, or two versions of a tile.
 
@@ -139,6 +139,7 @@ def map_changes(
         old_at_ns: the old state's time, UTC; None: its newest versions.
         tile: only this tile, ...
         versions: ... these two versions of it.
+        only: only these tiles; None: all of the region.
 
     Raises:
         StoreError: a layer of features, or no tiles in either.
@@ -146,7 +147,7 @@ def map_changes(
     """
     if is_feature_layer(layer):
         raise StoreError(f"layer {layer!r} holds features: `gnd map diff` lists them, --to is for layers of Gaussians")
-    tiles = [tile] if tile else sorted({one.tile for store in (old, new) for one in store.heads(layer, prefix)})
+    tiles = [tile] if tile else sorted(only or {one.tile for store in (old, new) for one in store.heads(layer, prefix)})
     if not tiles:
         raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
     numbers = versions or (None, None)

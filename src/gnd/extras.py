@@ -8,7 +8,9 @@ from typing import Final
 
 from gnd.gnd_map.errors import GndError
 
-LEFT_OUT: Final = frozenset(("gtsam", "matplotlib", "mpl_toolkits", "psutil", "scipy", "sklearn", "small_gicp"))
+OF_THE_PAGE: Final = frozenset(("starlette", "uvicorn", "websockets"))
+"""Modules of `gnd serve`; a fleet goes without them, and says so."""
+LEFT_OUT: Final = OF_THE_PAGE | {"gtsam", "matplotlib", "mpl_toolkits", "psutil", "scipy", "sklearn", "small_gicp"}
 """Modules of other projects that only extras bring; pyproject.toml has the same table by extra."""
 EXTRA_OF: Final = {
     "gnd.vehicle_agent": "vehicle",
@@ -28,18 +30,20 @@ def missing_extra(error: ModuleNotFoundError) -> MissingExtra | None:
     module = (error.name or "").split(".")[0]
     if module not in LEFT_OUT:
         return None
+    if module in OF_THE_PAGE:
+        return MissingExtra(f"{module} is not installed; it comes with: pip install 'gnd-fleet[serve]'")
     packages = [".".join(name.split(".")[:2]) for name in _modules(error.__traceback__)]
     extra = next((EXTRA_OF[package] for package in reversed(packages) if package in EXTRA_OF), "all")
     return MissingExtra(f"{module} is not installed; it comes with: pip install 'gnd-fleet[{extra}]'")
 
 
 def need_all() -> None:
-    """For commands that run every part of the system: refuse to begin where one is not installed.
+    """For commands that run every part of the system but the page: refuse to begin where one is not installed.
 
     Raises:
         MissingExtra: with the modules that are missing.
     """
-    missing = sorted(name for name in LEFT_OUT if not _is_there(name))
+    missing = sorted(name for name in LEFT_OUT - OF_THE_PAGE if not _is_there(name))
     if missing:
         raise MissingExtra(f"{', '.join(missing)}: not installed; this command needs: pip install 'gnd-fleet[all]'")
 

@@ -14,7 +14,7 @@ from gnd.fleet_sim.street import StreetOptions, street
 from gnd.fleet_sim.world import write_world
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = {name: PROJECT["optional-dependencies"][name] for name in ("vehicle", "cloud", "sim")}
+EXTRAS = {name: PROJECT["optional-dependencies"][name] for name in ("vehicle", "cloud", "sim", "serve")}
 
 
 def name_of(requirement: str) -> str:
@@ -153,7 +153,7 @@ def test_a_fleet_without_all_extras_names_them_before_anything_is_written(
     )
     assert program.end() == 2, program.lines
     (line,) = program.lines
-    missing = ", ".join(sorted(extras.LEFT_OUT))
+    missing = ", ".join(sorted(extras.LEFT_OUT - extras.OF_THE_PAGE))
     assert line == f"gnd: {missing}: not installed; this command needs: pip install 'gnd-fleet[all]'"
     assert not (tmp_path / "f").exists()
 
@@ -170,11 +170,17 @@ def test_a_vehicle_without_its_extra_says_so_when_it_is_made(bare: Callable[...,
     assert "comes with: pip install 'gnd-fleet[vehicle]'" in program.lines[-1]
 
 
+def test_the_page_without_its_extra_says_which(bare: Callable[..., Program]) -> None:
+    program = bare("from gnd.deploy.cli import main; sys.argv[0] = 'gnd'; main()", "serve", "map.sqlite")
+    assert program.end() == 2, program.lines
+    assert "comes with: pip install 'gnd-fleet[serve]'" in program.lines[-1]
+
+
 def test_the_table_of_what_is_left_out_is_that_of_pyproject() -> None:
     base = with_dependencies(PROJECT["dependencies"])
     brought = {name_of(one) for requirements in EXTRAS.values() for one in requirements} - base
     module_of = {"scikit-learn": "sklearn", "small-gicp": "small_gicp"}
     assert {module_of.get(name, name) for name in brought} == extras.LEFT_OUT - {"mpl_toolkits"}
-    assert set(extras.EXTRA_OF.values()) == set(EXTRAS)
-    assert PROJECT["optional-dependencies"]["all"] == ["gnd-fleet[vehicle,cloud,sim]"]
+    assert {*extras.EXTRA_OF.values(), "serve"} == set(EXTRAS)
+    assert PROJECT["optional-dependencies"]["all"] == ["gnd-fleet[vehicle,cloud,sim,serve]"]
     assert not base & {"gtsam", "scipy", "scikit-learn", "small-gicp", "matplotlib", "pyproj"}

@@ -1,0 +1,148 @@
+"""What stands beside the map: the work list of changes, the traffic against mobile links, how the cloud stands.
+
+Each is computed when a browser asks and kept for a while: the longer it took, the longer.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from math import radians
+from typing import Any, Final, Generic, TypeVar
+
+from gnd.deploy.map_export.changes import Change, map_changes
+from gnd.deploy.run_folder import RunFolder
+from gnd.deploy.serve.page_map import PageMap
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger_file import read_run
+from gnd.fleet_bus.links import load_link
+from gnd.fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.sqlite_store import SqlStore
+from gnd.tile_store.status import WORDS, status_of
+
+MOST_CHANGES: Final = 500
+MOST_CHANGED_TILES: Final = 2_000
+"""Of a large map the work list names the changes of the tiles that changed last."""
+MOST_ROWS: Final = 100
+_KEPT_S: Final = 2.0
+_SHARE: Final = 0.1
+_T = TypeVar("_T")
+
+
+class Remembered(Generic[_T]):
+    """A value that is computed anew when it is asked for and not too young.
+
+    Args:
+        compute: makes the value; one thread at a time.
+    """
+
+    def __init__(self, compute: Callable[[], _T]) -> None:
+        self._compute, self._lock = compute, threading.Lock()
+        self._value: list[_T] = []
+        self._until_s = 0.0
+
+    def get(self) -> _T:
+        """The value."""
+        with self._lock:
+            begin_s = time.monotonic()
+            if not self._value or begin_s >= self._until_s:
+                self._value = [self._compute()]
+                end_s = time.monotonic()
+                self._until_s = end_s + max(_KEPT_S, (end_s - begin_s) / _SHARE)
+            return self._value[0]
+
+
+def changes(shown: PageMap) -> dict[str, Any]:
+    """Object-like clusters of what changed since the survey, largest first, each with its place in the map's frame.
+
+    Raises:
+        MissingExtra: scikit-learn is not installed.
+    """
+    columns = shown.heads.columns
+    rows = [row for row in columns.created_ns.argsort()[::-1].tolist() if columns.version[row] > 1]
+    tiles = [TileId(int(columns.morton[row])) for row in rows[:MOST_CHANGED_TILES]]
+    if not tiles:
+        return {"changes": [], "alone": 0, "left_out": 0}
+    found = map_changes(shown.store, shown.store, layer=shown.layer, old_at_ns=_surveyed_ns(shown, tiles), only=tiles)
+    listed = [_change(shown, one) for one in found.changes[:MOST_CHANGES]]
+    return {"changes": listed, "alone": found.alone, "left_out": len(found.changes) - len(listed)}
+
+
+def _surveyed_ns(shown: PageMap, tiles: list[TileId]) -> int:
+    """When the last of some tiles was put into the map by a survey; of tiles that vehicles have made nothing counts."""
+    first = [shown.store.history(shown.layer, tile)[0] for tile in tiles]
+    return max((line.created_ns for line in first if line.kind == "base"), default=0)
+
+
+def _change(shown: PageMap, one: Change) -> dict[str, Any]:
+    at = shown.frame.enu_from_geodetic(radians(one.lat_deg), radians(one.lon_deg), one.height_m)
+    return one.as_dict() | {"at_m": [round(float(x), 2) for x in at]}
+
+
+def traffic(run: RunFolder | None) -> dict[str, Any]:
+    """What the vehicles of a run have sent and received, and how much of 3G, 4G and 5G that is; `problem` says why
+    there is nothing to say.
+    """
+    if run is None:
+        return {"problem": "a store alone has no account of traffic: serve the folder of a run"}
+    links = tuple(load_link(name) for name in DEFAULT_LINKS)
+    try:
+        agents = tuple(agent_traffic(ledger, links) for ledger in read_run(run.root))
+    except LedgerError as error:
+        return {"problem": f"no account of traffic yet: {error}"}
+    return {
+        "problem": "",
+        "fleet": fleet_totals(agents) | {"lines": [asdict(line) for line in fleet_lines(agents)]},
+        "links": [_link(link.name, agents) for link in links],
+        "vehicles": [_agent(agent) for agent in agents],
+    }
+
+
+def _agent(agent: AgentTraffic) -> dict[str, Any]:
+    names = ("agent", "link", "drive_km", "drive_s", "up_wire_bytes", "down_wire_bytes", "along")
+    return {name: getattr(agent, name) for name in names}
+
+
+def _link(name: str, agents: tuple[AgentTraffic, ...]) -> dict[str, Any]:
+    """The vehicle that needs most of a link, and the longest wait of any message, by direction."""
+    told: dict[str, Any] = {"link": name}
+    for direction in ("down", "up"):
+        uses = [use for agent in agents for use in agent.links if (use.link, use.direction) == (name, direction)]
+        told[f"{direction}_share"] = max((use.share for use in uses), default=0.0)
+        told[f"{direction}_wait_s"] = max((use.longest_wait_s for use in uses), default=0.0)
+    return told
+
+
+def status(store: SqlStore) -> dict[str, Any]:
+    """How the cloud stands: as `gnd map status --json`, the long lists cut."""
+    told = status_of(store)
+    waiting = told["waiting_for_confirmation"]
+    waiting["claims"] = [
+        one | {"why": WORDS.get(one["reason"], one["reason"])} for one in waiting["claims"][:MOST_ROWS]
+    ]
+    for name in ("set_aside", "to_merge", "named_vehicles"):
+        told[name] = told[name][:MOST_ROWS]
+    return told
+
+
+@dataclass(frozen=True, slots=True)
+class Panels:
+    """What stands beside one map.
+
+    Attributes:
+        changes, traffic, status: each as the function of that name gives it.
+    """
+
+    changes: Remembered[dict[str, Any]]
+    traffic: Remembered[dict[str, Any]]
+    status: Remembered[dict[str, Any]]
+
+    @classmethod
+    def of(cls, shown: PageMap, run: RunFolder | None) -> "Panels":
+        """The panels of a map."""
+        return cls(
+            Remembered(lambda: changes(shown)),
+            Remembered(lambda: traffic(run)),
+            Remembered(lambda: status(shown.store)),
+        )

@@ -1,0 +1,215 @@
+// What lies over the Gaussians: the ground plan of all tiles, vehicles, features, and what is selected.
+
+import * as THREE from "three";
+import { ask, askBytes, type About, type Feature, type Vehicle } from "./api";
+import { palette } from "./colours";
+import { make } from "./dom";
+
+/** Every tile of the map as a square on the ground: what is seen of a city before its tiles are near. */
+export async function overview(about: About, group: THREE.Group): Promise<void> {
+  const bytes = await askBytes("overview.bin");
+  const n = bytes.byteLength / 16;
+  const [x, y] = [new Float32Array(bytes, 0, n), new Float32Array(bytes, 4 * n, n)];
+  const version = new Uint32Array(bytes, 8 * n, n);
+  const square = new THREE.PlaneGeometry(1, 1);
+  const mesh = new THREE.InstancedMesh(square, new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.13, depthWrite: false }), n);
+  const [lat] = about.origin_deg;
+  const [dy, dx] = [38.2, 38.2 * Math.cos((lat * Math.PI) / 180)];
+  const matrix = new THREE.Matrix4();
+  const [still, changed] = [new THREE.Color(palette.change.surveyed), new THREE.Color(palette.change.new)];
+  for (let i = 0; i < n; i++) {
+    matrix.makeScale(dx * 0.94, dy * 0.94, 1).setPosition(x[i], y[i], about.ground_m - 1.5);
+    mesh.setMatrixAt(i, matrix);
+    mesh.setColorAt(i, version[i] > 1 ? changed : still);
+  }
+  mesh.frustumCulled = false;
+  mesh.renderOrder = -1;
+  group.clear();
+  group.add(mesh);
+}
+
+const HEALTH: Record<string, string> = palette.health;
+
+function arrow(): THREE.BufferGeometry {
+  const shape = new THREE.Shape();
+  shape.moveTo(2.6, 0).lineTo(-1.6, 1.35).lineTo(-0.9, 0).lineTo(-1.6, -1.35).closePath();
+  const geometry = new THREE.ExtrudeGeometry(shape, { depth: 0.7, bevelEnabled: false });
+  return geometry;
+}
+
+/** Vehicles as arrows with a label each. */
+export class Vehicles {
+  readonly group = new THREE.Group();
+  readonly known = new Map<string, Vehicle>();
+  private readonly marks = new Map<string, { mesh: THREE.Mesh; label: HTMLElement; name: HTMLElement; health: HTMLElement }>();
+  private readonly shape = arrow();
+  ways: Record<string, [number, number, number, number][]> = {};
+  isShown = true;
+
+  constructor(private readonly labels: HTMLElement) {}
+
+  take(told: Vehicle[]): void {
+    for (const one of told) {
+      this.known.set(one.name, one);
+      if (one.at) {
+        const way = (this.ways[one.name] ??= []);
+        if (!way.length || way[way.length - 1][0] < one.at[0]) way.push(one.at);
+      }
+    }
+  }
+
+  /** Places the arrows as at a time (Infinity: now) and their labels as the camera sees them. */
+  draw(time_ms: number, camera: THREE.Camera, width: number, height: number): void {
+    for (const [name, vehicle] of this.known) {
+      const at = time_ms === Infinity ? vehicle.at : placeAt(this.ways[name] ?? [], time_ms);
+      const mark = this.mark(name, vehicle);
+      const isThere = this.isShown && at !== null;
+      mark.mesh.visible = isThere;
+      mark.label.hidden = !isThere;
+      if (!at || !isThere) continue;
+      mark.mesh.position.set(at[1], at[2], at[3] + 1.2);
+      const heading = time_ms === Infinity ? vehicle.heading_rad : headingAt(this.ways[name] ?? [], time_ms);
+      mark.mesh.rotation.z = heading ?? 0;
+      const far = camera.position.distanceTo(mark.mesh.position);
+      mark.mesh.scale.setScalar(Math.max(1, far / 90));
+      this.put(mark.label, mark.mesh.position.clone().add(new THREE.Vector3(0, 0, 2 + far / 60)), camera, width, height);
+    }
+  }
+
+  private put(label: HTMLElement, at: THREE.Vector3, camera: THREE.Camera, width: number, height: number): void {
+    const p = at.project(camera);
+    const isSeen = p.z < 1 && Math.abs(p.x) < 1.1 && Math.abs(p.y) < 1.1;
+    label.hidden = !isSeen;
+    if (isSeen) label.style.transform = `translate(-50%, -100%) translate(${(((p.x + 1) / 2) * width).toFixed(1)}px, ${(((1 - p.y) / 2) * height).toFixed(1)}px)`;
+  }
+
+  private mark(name: string, vehicle: Vehicle) {
+    let mark = this.marks.get(name);
+    if (!mark) {
+      const mesh = new THREE.Mesh(this.shape, new THREE.MeshBasicMaterial());
+      const words = { name: make("span", {}, name), health: make("span", { class: "soft" }) };
+      const label = make("div", { class: "label" }, words.name, words.health);
+      mark = { mesh, label, ...words };
+      this.marks.set(name, mark);
+      this.group.add(mesh);
+      this.labels.append(label);
+    }
+    (mark.mesh.material as THREE.MeshBasicMaterial).color.set(HEALTH[vehicle.health] ?? palette.health.good);
+    mark.health.textContent = vehicle.health && vehicle.health !== "good" ? vehicle.health : "";
+    return mark;
+  }
+}
+
+type Way = [number, number, number, number][];
+
+function indexAt(way: Way, time_ms: number): number {
+  let [low, high] = [0, way.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (way[middle][0] <= time_ms) low = middle + 1;
+    else high = middle;
+  }
+  return low - 1;
+}
+
+function placeAt(way: Way, time_ms: number): [number, number, number, number] | null {
+  const i = indexAt(way, time_ms);
+  if (i < 0) return null;
+  const [a, b] = [way[i], way[i + 1]];
+  if (!b) return time_ms - a[0] > 30_000 ? null : a;
+  const part = (time_ms - a[0]) / Math.max(b[0] - a[0], 1);
+  return [time_ms, ...[1, 2, 3].map((c) => a[c] + part * (b[c] - a[c]))] as [number, number, number, number];
+}
+
+function headingAt(way: Way, time_ms: number): number | null {
+  const i = Math.max(0, Math.min(indexAt(way, time_ms), way.length - 2));
+  const [a, b] = [way[i], way[i + 1]];
+  return a && b ? Math.atan2(b[2] - a[2], b[1] - a[1]) : null;
+}
+
+/** Layers of features: lines as lines, points as posts with a sign of their kind. */
+export class Features {
+  readonly group = new THREE.Group();
+  private readonly layers = new Map<string, THREE.Group>();
+
+  async show(layer: string, isShown: boolean): Promise<number> {
+    const known = this.layers.get(layer);
+    if (known) {
+      known.visible = isShown;
+      return known.children.length;
+    }
+    if (!isShown) return 0;
+    const told = await ask<{ features: Feature[] }>(`features/${encodeURIComponent(layer)}`);
+    const group = new THREE.Group();
+    const points = told.features.filter((one) => one.points_m.length === 1);
+    const lines = told.features.filter((one) => one.points_m.length > 1);
+    if (points.length) group.add(...posts(points));
+    if (lines.length) group.add(strokes(lines));
+    this.layers.get(layer)?.removeFromParent();
+    this.layers.set(layer, group);
+    this.group.add(group);
+    return told.features.length;
+  }
+
+  async renew(layer: string): Promise<void> {
+    const known = this.layers.get(layer);
+    if (!known) return;
+    this.layers.delete(layer);
+    known.removeFromParent();
+    await this.show(layer, known.visible);
+  }
+}
+
+const SYMBOLS: [RegExp, string, string][] = [
+  [/sign/, "triangle", palette.change.new],
+  [/light|lamp/, "disc", "#f7e26b"],
+  [/pole|post/, "bar", palette.surface.other],
+];
+
+function symbol(shape: string, colour: string): THREE.Texture {
+  const canvas = document.createElement("canvas");
+  canvas.width = canvas.height = 64;
+  const c = canvas.getContext("2d")!;
+  c.fillStyle = colour;
+  c.strokeStyle = "#10212b";
+  c.lineWidth = 6;
+  c.beginPath();
+  if (shape === "triangle") {
+    c.moveTo(32, 7);
+    c.lineTo(58, 54);
+    c.lineTo(6, 54);
+    c.closePath();
+  } else if (shape === "bar") c.rect(22, 6, 20, 52);
+  else c.arc(32, 32, 24, 0, 7);
+  c.fill();
+  c.stroke();
+  return new THREE.CanvasTexture(canvas);
+}
+
+function posts(features: Feature[]): THREE.Object3D[] {
+  const [, shape, colour] = SYMBOLS.find(([kind]) => kind.test(features[0].kind)) ?? ["", "disc", palette.surface.upright];
+  const at = features.map((one) => one.points_m[0]);
+  const heads = new THREE.BufferGeometry().setAttribute("position", new THREE.Float32BufferAttribute(at.flat(), 3));
+  const material = new THREE.PointsMaterial({ map: symbol(shape, colour), size: 22, sizeAttenuation: false, transparent: true, alphaTest: 0.4, depthTest: false });
+  return [new THREE.Points(heads, material)];
+}
+
+function strokes(features: Feature[]): THREE.Object3D {
+  const at: number[] = [];
+  for (const one of features) {
+    for (let i = 1; i < one.points_m.length; i++) {
+      for (const p of [one.points_m[i - 1], one.points_m[i]]) at.push(p[0], p[1], p[2] + 0.15);
+    }
+  }
+  const geometry = new THREE.BufferGeometry().setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
+  return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color: palette.surface.line }));
+}
+
+/** A frame of one metre around what is selected. */
+export function selection(): THREE.LineSegments {
+  const box = new THREE.EdgesGeometry(new THREE.BoxGeometry(1.15, 1.15, 1.15));
+  const mesh = new THREE.LineSegments(box, new THREE.LineBasicMaterial({ color: "#ffffff", depthTest: false }));
+  mesh.visible = false;
+  mesh.renderOrder = 5;
+  return mesh;
+}

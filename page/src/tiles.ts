@@ -1,0 +1,350 @@
+// The tiles in view: which versions are shown, loaded by distance, as ellipsoids, discs or merged blocks.
+
+import * as THREE from "three";
+import { ask, askBytes, type About, type TileInfo } from "./api";
+import { palette, rgb, type Shades } from "./colours";
+import { flash, geometryOf, type Looks, meets, paint, paintOne } from "./gaussians";
+import { missing, type Packed, renewed, subset, unpack } from "./packed";
+
+const NEAR_M = 55;
+const FINE_M = 320;
+const REACH_M = 1500;
+const AT_ONCE = 6;
+const MOST_GAUSSIANS = 2_500_000;
+const GHOST_S = 3.0;
+
+interface Loaded {
+  packed: Packed;
+  geometry: THREE.InstancedBufferGeometry;
+  painted: string;
+}
+
+export interface Side {
+  /** POSIX ms; Infinity: the newest. */
+  time_ms: number;
+  group: THREE.Group;
+}
+
+interface Slot {
+  mesh: THREE.Mesh;
+  loaded: Loaded | null;
+}
+
+class Tile {
+  readonly loaded = new Map<string, Loaded>();
+  readonly slots: [Slot, Slot];
+  readonly centre: THREE.Vector3;
+  readonly matrix: THREE.Matrix4;
+  ghost: { mesh: THREE.Mesh; of: string; until_s: number } | null = null;
+  far = 0;
+  isListed = true;
+
+  constructor(public info: TileInfo, looks: Looks, ground_m: number, groups: [THREE.Group, THREE.Group]) {
+    const [x, y, z] = info.place;
+    const t = info.turn;
+    this.matrix = new THREE.Matrix4().set(t[0], t[1], t[2], x, t[3], t[4], t[5], y, t[6], t[7], t[8], z, 0, 0, 0, 1);
+    this.centre = new THREE.Vector3(x, y, z + ground_m);
+    this.slots = groups.map((group) => {
+      const mesh = new THREE.Mesh(new THREE.InstancedBufferGeometry(), looks.disc);
+      mesh.matrixAutoUpdate = false;
+      mesh.matrix.copy(this.matrix);
+      mesh.visible = false;
+      group.add(mesh);
+      return { mesh, loaded: null };
+    }) as unknown as [Slot, Slot];
+  }
+
+  versionAt(time_ms: number): number {
+    const { versions } = this.info;
+    for (let i = versions.length - 1; i >= 0; i--) if (versions[i][1] <= time_ms) return versions[i][0];
+    return 0;
+  }
+}
+
+export interface Hit {
+  tile: TileInfo;
+  version: number;
+  packed: Packed;
+  row: number;
+  at: THREE.Vector3;
+}
+
+export class Tiles {
+  readonly tiles = new Map<number, Tile>();
+  readonly before: Side = { time_ms: 0, group: new THREE.Group() };
+  readonly after: Side = { time_ms: Infinity, group: new THREE.Group() };
+  readonly ghosts = new THREE.Group();
+  comparing = false;
+  showGhosts = true;
+  /** Below 1 less is drawn finely. */
+  quality = 1;
+  drawn = { tiles: 0, gaussians: 0 };
+  leftOut = 0;
+  private wanted: { tile: Tile; version: number; level: number; far: number }[] = [];
+  private underway = new Set<string>();
+  private failed = new Map<string, number>();
+  private listedAt: { x: number; y: number; reach: number } | null = null;
+  private listing = false;
+
+  constructor(
+    private readonly about: About,
+    private readonly looks: Looks,
+    private shades: Shades,
+    private readonly changed: () => void,
+    private readonly trouble: (text: string) => void,
+  ) {}
+
+  get isLoading(): boolean {
+    return this.underway.size > 0 || this.listing || this.wanted.length > 0;
+  }
+
+  get isEmpty(): boolean {
+    return this.tiles.size === 0;
+  }
+
+  /** Lists the tiles around a place again when the view has moved on. */
+  async lookAround(target: THREE.Vector3, reach_m: number, anew = false): Promise<void> {
+    const reach = Math.min(Math.max(reach_m, 150), REACH_M);
+    const was = this.listedAt;
+    const isNear = was && Math.hypot(target.x - was.x, target.y - was.y) < 0.25 * was.reach && Math.abs(Math.log(reach / was.reach)) < 0.35;
+    if (this.listing || (isNear && !anew)) return;
+    this.listing = true;
+    this.listedAt = { x: target.x, y: target.y, reach };
+    try {
+      const box = [target.x - reach, target.y - reach, target.x + reach, target.y + reach].map((one) => one.toFixed(1));
+      const told = await ask<{ tiles: TileInfo[]; left_out: number }>(`tiles?box=${box.join(",")}`);
+      this.leftOut = told.left_out;
+      const listed = new Set(told.tiles.map((one) => one.id));
+      for (const [id, tile] of this.tiles) tile.isListed = listed.has(id);
+      for (const info of told.tiles) this.take(info);
+      this.forget();
+    } catch (error) {
+      this.listedAt = null;
+      this.trouble(`The tiles here could not be listed: ${(error as Error).message}`);
+    } finally {
+      this.listing = false;
+      this.changed();
+    }
+  }
+
+  take(info: TileInfo): Tile {
+    let tile = this.tiles.get(info.id);
+    if (tile) tile.info = info;
+    else {
+      tile = new Tile(info, this.looks, this.about.ground_m, [this.before.group, this.after.group]);
+      this.tiles.set(info.id, tile);
+    }
+    return tile;
+  }
+
+  /** A version was published: load it at once, and let what it changed flash. */
+  async update(info: TileInfo, before: number): Promise<void> {
+    const tile = this.tiles.get(info.id);
+    if (!tile && this.listedAt) {
+      const far = Math.hypot(info.place[0] - this.listedAt.x, info.place[1] - this.listedAt.y);
+      if (far > this.listedAt.reach) return;
+    }
+    const known = this.take(info);
+    if (this.after.time_ms !== Infinity) return this.changed();
+    try {
+      const [old, now] = await Promise.all([before ? this.load(known, before, 0) : null, this.load(known, info.version, 0)]);
+      const now_s = performance.now() / 1000;
+      flash(now.geometry, old ? renewed(old.packed, now.packed) : [...Array(now.packed.n).keys()], now_s);
+      if (old) this.leave(known, old.packed, now.packed, now_s + GHOST_S);
+    } catch (error) {
+      this.trouble(`Version ${info.version} of a tile could not be read: ${(error as Error).message}`);
+    }
+    this.changed();
+  }
+
+  setShades(shades: Shades): void {
+    this.shades = shades;
+    this.changed();
+  }
+
+  /** Chooses what is drawn for a camera; true: something is still on its way. */
+  arrange(camera: THREE.Vector3): boolean {
+    this.wanted = [];
+    this.drawn = { tiles: 0, gaussians: 0 };
+    const now_s = performance.now() / 1000;
+    for (const tile of this.tiles.values()) {
+      tile.far = Math.max(0, tile.centre.distanceTo(camera) - 20);
+      this.arrangeSide(tile, 1, this.after);
+      if (this.comparing) this.arrangeSide(tile, 0, this.before);
+      else tile.slots[0].mesh.visible = false;
+      this.arrangeGhost(tile, now_s);
+    }
+    this.wanted.sort((a, b) => a.far - b.far);
+    this.fetchSome();
+    return this.isLoading;
+  }
+
+  private arrangeSide(tile: Tile, index: 0 | 1, side: Side): void {
+    const slot = tile.slots[index];
+    const version = tile.versionAt(side.time_ms);
+    const level = tile.far > FINE_M * this.quality ? 1 : 0;
+    if (!version || !tile.isListed) {
+      slot.mesh.visible = false;
+      slot.loaded = null;
+      return;
+    }
+    const best = tile.loaded.get(`${version}/${level}`);
+    if (!best) this.want(tile, version, level);
+    const found = best ?? tile.loaded.get(`${version}/0`) ?? tile.loaded.get(`${version}/1`) ?? slot.loaded;
+    slot.mesh.visible = found !== null;
+    slot.loaded = found;
+    if (!found) return;
+    this.show(tile, slot, found);
+    if (index === 1) {
+      this.drawn.tiles++;
+      this.drawn.gaussians += found.packed.n;
+    }
+  }
+
+  private show(tile: Tile, slot: Slot, found: Loaded): void {
+    slot.mesh.geometry = found.geometry;
+    const isNear = tile.far < NEAR_M * this.quality && found.packed.level === 0;
+    slot.mesh.material = isNear ? this.looks.ellipsoid : this.looks.disc;
+    const { mode, low, high, from_s, now_s } = this.shades;
+    const how = `${mode}/${low}/${high}/${from_s}/${mode === "age" ? Math.floor(now_s / 30) : 0}`;
+    if (found.painted !== how) {
+      paint(found.geometry, found.packed, tile.info.place[2], this.shades);
+      found.painted = how;
+    }
+  }
+
+  /** What was removed since the time before stays to be seen, as long as changes are shown. */
+  private arrangeGhost(tile: Tile, now_s: number): void {
+    if (tile.ghost && tile.ghost.until_s !== Infinity) {
+      if (now_s < tile.ghost.until_s) return;
+      this.dropGhost(tile);
+    }
+    const [a, b] = [tile.versionAt(this.before.time_ms), tile.versionAt(this.after.time_ms)];
+    const isWanted = this.showGhosts && this.shades.mode === "change" && a && b && a !== b && tile.isListed && tile.far < FINE_M * this.quality;
+    const of = `${a}-${b}`;
+    if (!isWanted || (tile.ghost && tile.ghost.of !== of)) this.dropGhost(tile);
+    if (!isWanted || tile.ghost) return;
+    const old = tile.loaded.get(`${a}/0`);
+    const now = tile.loaded.get(`${b}/0`);
+    if (!old) this.want(tile, a, 0);
+    if (old && now) this.makeGhost(tile, old.packed, now.packed, of, Infinity);
+  }
+
+  private leave(tile: Tile, old: Packed, now: Packed, until_s: number): void {
+    if (this.showGhosts && this.shades.mode === "change") return; // they stay anyway
+    this.dropGhost(tile);
+    this.makeGhost(tile, old, now, "", until_s);
+  }
+
+  private makeGhost(tile: Tile, old: Packed, now: Packed, of: string, until_s: number): void {
+    const gone = subset(old, missing(old, now));
+    const geometry = geometryOf(gone);
+    paintOne(geometry, rgb(palette.change.removed));
+    const mesh = new THREE.Mesh(geometry, this.looks.ghost);
+    mesh.matrixAutoUpdate = false;
+    mesh.matrix.copy(tile.matrix);
+    this.ghosts.add(mesh);
+    tile.ghost = { mesh, of, until_s };
+  }
+
+  private dropGhost(tile: Tile): void {
+    if (!tile.ghost) return;
+    this.ghosts.remove(tile.ghost.mesh);
+    tile.ghost.mesh.geometry.dispose();
+    tile.ghost = null;
+  }
+
+  private want(tile: Tile, version: number, level: number): void {
+    const name = `${tile.info.id}/${version}/${level}`;
+    const failed_s = this.failed.get(name);
+    if (this.underway.has(name) || (failed_s !== undefined && performance.now() / 1000 - failed_s < 5)) return;
+    this.wanted.push({ tile, version, level, far: tile.far });
+  }
+
+  private fetchSome(): void {
+    while (this.wanted.length && this.underway.size < AT_ONCE) {
+      const { tile, version, level } = this.wanted.shift()!;
+      this.load(tile, version, level)
+        .catch((error) => this.trouble(`A tile could not be read: ${error.message}`))
+        .finally(() => {
+          this.changed();
+        });
+    }
+  }
+
+  private async load(tile: Tile, version: number, level: number): Promise<Loaded> {
+    const place = `${version}/${level}`;
+    const known = tile.loaded.get(place);
+    if (known) return known;
+    const name = `${tile.info.id}/${place}`;
+    this.underway.add(name);
+    try {
+      const packed = unpack(await askBytes(`tiles/${tile.info.id}/${version}.bin?level=${level}&map=${this.about.key}`));
+      const loaded = tile.loaded.get(place) ?? { packed, geometry: geometryOf(packed), painted: "" };
+      tile.loaded.set(place, loaded);
+      this.failed.delete(name);
+      return loaded;
+    } catch (error) {
+      this.failed.set(name, performance.now() / 1000);
+      throw error;
+    } finally {
+      this.underway.delete(name);
+    }
+  }
+
+  /** Memory is for what is near. */
+  private forget(): void {
+    let held = 0;
+    const by_distance = [...this.tiles.values()].sort((a, b) => Number(b.isListed) - Number(a.isListed) || a.far - b.far);
+    for (const tile of by_distance) {
+      for (const [place, one] of tile.loaded) {
+        held += one.packed.n;
+        const isShown = tile.slots.some((slot) => slot.loaded === one);
+        if (held > MOST_GAUSSIANS && !isShown) {
+          one.geometry.dispose();
+          tile.loaded.delete(place);
+        }
+      }
+    }
+  }
+
+  /** The Gaussian that a ray of the map's frame meets first, on one side. */
+  pick(ray: THREE.Ray, isBefore: boolean): Hit | null {
+    let best: (Hit & { far: number }) | null = null;
+    for (const tile of this.tiles.values()) {
+      const slot = tile.slots[isBefore ? 0 : 1];
+      if (!slot.mesh.visible || !slot.loaded || slot.loaded.packed.level !== 0) continue;
+      const back = tile.matrix.clone().invert();
+      const from = ray.origin.clone().applyMatrix4(back);
+      const along = ray.direction.clone().transformDirection(back);
+      const found = meets(slot.loaded.packed, from, along);
+      if (found && (best === null || found.far < best.far)) {
+        const p = slot.loaded.packed;
+        const at = new THREE.Vector3().fromArray(p.mean, 3 * found.row).applyMatrix4(tile.matrix);
+        best = { tile: tile.info, version: p.version, packed: p, row: found.row, at, far: found.far };
+      }
+    }
+    return best;
+  }
+
+  /** Times of the versions of the tiles that are known, POSIX ms, ascending. */
+  times(): number[] {
+    const found: number[] = [];
+    for (const tile of this.tiles.values()) for (const [, at] of tile.info.versions) found.push(at);
+    return found.sort((a, b) => a - b);
+  }
+
+  /** Heights between which nearly all that is loaded lies. */
+  heights(): [number, number] {
+    const some: number[] = [];
+    for (const tile of this.tiles.values()) {
+      const p = tile.slots[1].loaded?.packed;
+      if (!p) continue;
+      const step = Math.max(1, Math.floor(p.n / 60));
+      for (let i = 0; i < p.n; i += step) some.push(p.mean[3 * i + 2] + tile.info.place[2]);
+    }
+    some.sort((a, b) => a - b);
+    if (some.length < 20) return [this.about.ground_m - 2, this.about.ground_m + 12];
+    return [some[Math.floor(0.01 * some.length)], some[Math.floor(0.985 * some.length)]];
+  }
+}
