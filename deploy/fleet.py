@@ -19,6 +19,7 @@ from gnd.cloud_merger.merger import ShardConfig
 from gnd.deploy import roles
 from gnd.deploy.errors import DeployError
 from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.fleet_page import page_process
 from gnd.deploy.live import FleetState, LiveView, live_view
 from gnd.deploy.live_traffic import LiveLedgers
 from gnd.deploy.map_use import Versions, map_use, read_ways
@@ -73,6 +74,8 @@ def run_fleet(
     console: Console,
     stop: threading.Event,
     site: SiteFrame | None = None,
+    *,
+    page: bool = False,
 ) -> FleetOutcome:
     """Run the processes of a fleet until every drive is done and every report is merged.
 
@@ -83,6 +86,7 @@ def run_fleet(
         console: where the live table appears.
         stop: ends the run early and in order.
         site: where the processes run; by default all on the loopback interface.
+        page: show the run in the browser, too.
 
     Returns:
         How long it took and what had to be restarted.
@@ -99,6 +103,8 @@ def run_fleet(
     with ExitStack() as stack:
         supervisor = stack.enter_context(supervised(folder, state))
         start_cloud(supervisor, config, folder, site)
+        if page and (shown := page_process(folder, site, lambda text: console.print(text, soft_wrap=True))):
+            supervisor.start(shown)
         opened = stack.enter_context(SqliteStore(folder.store))
         own = BusConfig(connect=(site.connect,), identity=site.identity_of("fleet"))
         bus = stack.enter_context(open_bus(own, name="fleet"))
@@ -124,7 +130,7 @@ def for_drives(config: FleetConfig, prepared: PreparedRun) -> FleetConfig:
 
 @contextmanager
 def supervised(folder: RunFolder, state: FleetState) -> Iterator[Supervisor]:
-    """Give a supervisor whose processes all end with the block: agents first, the router and its links last."""
+    """Give a supervisor whose processes all end with the block: page and agents first, router and links last."""
     supervisor = Supervisor(
         folder.logs, folder.pids, lambda name, code: state.note(f"{name} ended with code {code}, started again")
     )
@@ -132,7 +138,7 @@ def supervised(folder: RunFolder, state: FleetState) -> Iterator[Supervisor]:
         yield supervisor
     finally:
         names = tuple(supervisor.pids())
-        for group in ("vehicle-", "merger-", "watcher", "store", "router", "link-"):
+        for group in ("page", "vehicle-", "merger-", "watcher", "store", "router", "link-"):
             supervisor.stop(tuple(name for name in names if name.startswith(group)))
 
 

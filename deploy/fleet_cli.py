@@ -105,9 +105,11 @@ def run_options(command: _Command) -> _Command:
 @click.option(
     "--secure", is_flag=True, help="Certificates for all, made on the fly; TLS and rights by role on the bus."
 )
+@click.option("--no-page", is_flag=True, help="Show no live map in the browser.")
 @run_options
 def fleet(
     secure: bool,
+    no_page: bool,
     drives: tuple[Path, ...],
     base_map: Path | None,
     made_up: int,
@@ -141,7 +143,7 @@ def fleet(
     source = _imported(source, folder, quiet=as_json)
     if not as_json:
         click.echo(_SECURE if secure else _PLAIN, err=True)
-    summary = run(config, folder, source, keep_drives=keep_drives, secure=secure)
+    summary = run(config, folder, source, keep_drives=keep_drives, secure=secure, page=not no_page)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
     if base_map is not None and not as_json:
         for line in after_fleet(summary, base_map, folder):
@@ -183,6 +185,7 @@ def run(
     *,
     keep_drives: bool,
     secure: bool = False,
+    page: bool = False,
     place: Callable[[], AbstractContextManager[SiteFrame | None]] = nullcontext,
 ) -> dict[str, Any]:
     """Prepare and run a fleet and write its summary.
@@ -193,6 +196,7 @@ def run(
         source: drives and map.
         keep_drives: keep simulated drives.
         secure: give every process a certificate, and the bus TLS and rights.
+        page: show the run in the browser, too.
         place: gives the site while the processes run; by default all run on the loopback interface.
 
     Returns:
@@ -231,7 +235,7 @@ def run(
             sign_unsigned(store)  # the base map: without that no vehicle would take it
     prepare_s = time.monotonic() - started_s
     with orderly(), place() as site:
-        outcome = run_fleet(config, folder, prepared, console, threading.Event(), site)
+        outcome = run_fleet(config, folder, prepared, console, threading.Event(), site, page=page)
     result = summary.write_summary(config, folder, prepared, outcome, prepare_s)
     if not keep_drives:
         prepare.remove_drives(folder)
@@ -242,7 +246,11 @@ def summary_text(summary: dict[str, Any], folder: RunFolder) -> str:
     """Return the summary as a few lines for people."""
     from gnd.deploy.summary import summary_lines
 
-    lines = [*summary_lines(summary), f"everything else: {folder.root}"]
+    lines = [
+        *summary_lines(summary),
+        f"its map in the browser: gnd serve {folder.root}",
+        f"everything else: {folder.root}",
+    ]
     if folder.traffic_page.exists():
         lines.insert(-1, f"every byte of it: {folder.traffic_page}")
     return "\n".join(lines)

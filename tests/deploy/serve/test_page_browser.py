@@ -1,0 +1,293 @@
+"""The page in a real browser: it draws, follows, compares, tells what one clicks on, and is not fooled by names."""
+
+import io
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from page_testing import EAST, HERE, LiveStreet, ServedPage, live_street, served, street_tile
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+AXE = Path(__file__).parents[3] / "page" / "node_modules" / "axe-core" / "axe.min.js"
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+PATIENCE_S = 120.0
+"""For a machine on which others work; how fast the page is, `python -m studies serve` measures."""
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(600),
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        opened = started.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
+        yield opened
+        opened.close()
+
+
+class Window:
+    """A window of the browser with the page in it; whatever it complains of is kept."""
+
+    def __init__(self, browser: Any, url: str, **context: Any) -> None:
+        self.context = browser.new_context(viewport={"width": 900, "height": 640}, **context)
+        self.tab = self.context.new_page()
+        self.complaints: list[str] = []
+        self.tab.on(
+            "console", lambda one: self.complaints.append(one.text) if one.type in ("error", "warning") else None
+        )
+        self.tab.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.tab.goto(url)
+
+    def state(self) -> dict[str, Any]:
+        told: dict[str, Any] = self.tab.evaluate("window.gndPage ? gndPage.state : {}")
+        return told
+
+    def until(self, holds: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while True:
+            state = self.state()
+            if state and holds(state):
+                return state
+            assert time.monotonic() < deadline_s, f"not within {PATIENCE_S} s: {what}; {state}; {self.complaints}"
+            self.tab.wait_for_timeout(50)
+
+    def drawn(self) -> dict[str, Any]:
+        return self.until(lambda state: state["gaussians"] > 0 and not state["isLoading"], "the map is drawn")
+
+    def pixels(self) -> np.ndarray:
+        """(H, W, 3) what the map's window shows."""
+        from matplotlib.image import imread
+
+        picture = self.tab.locator("#map").screenshot(type="png")
+        return np.round(imread(io.BytesIO(picture))[:, :, :3] * 255).astype(int)
+
+    def close(self) -> None:
+        self.context.close()
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[..., Window]]:
+    windows: list[Window] = []
+
+    def begin(url: str, **context: Any) -> Window:
+        windows.append(Window(browser, url, **context))
+        return windows[-1]
+
+    yield begin
+    for window in windows:
+        window.close()
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> Iterator[LiveStreet]:
+    with live_street(tmp_path) as opened:
+        yield opened
+
+
+@pytest.fixture
+def page(street: LiveStreet) -> Iterator[ServedPage]:
+    with served(street.path, "--connect", street.endpoint) as opened:
+        yield opened
+
+
+def near(pixels: np.ndarray, colour: tuple[int, int, int], within: float = 0.12) -> int:
+    """How many pixels have a hue, whatever the light on them."""
+    length = np.linalg.norm(pixels, axis=2) + 1e-9
+    wanted = np.array(colour) / np.linalg.norm(colour)
+    is_lit = length > 60
+    return int((is_lit & (np.linalg.norm(pixels / length[:, :, None] - wanted, axis=2) < within)).sum())
+
+
+def test_it_draws_the_map_follows_it_and_stays_over_a_lost_router(
+    open_page: Callable[..., Window], street: LiveStreet, page: ServedPage
+) -> None:
+    window = open_page(page.url)
+    assert window.drawn()["gaussians"] == len(street_tile(HERE).gaussians) + len(
+        street_tile(EAST, wall=False).gaussians
+    )
+    before = window.pixels()
+    assert near(before, (174, 181, 186)) > 0.02 * before[:, :, 0].size, "the ground is grey"
+    assert near(before, (239, 156, 29)) == 0, "nothing is new"
+
+    street.merge(street_tile(EAST, wall=True))
+    window.until(lambda state: any(one["drawn_ms"] for one in state["updates"]), "an update is drawn")
+    window.tab.wait_for_timeout(3500)  # the flash is over
+    window.drawn()
+    assert near(window.pixels(), (239, 156, 29)) > 200, "the new wall is orange"
+
+    street.stop_router()
+    street.start_router()
+    version = street.merge(street_tile(EAST, wall=True, hump=0.3))
+    window.until(
+        lambda state: any(one["version"] == version and one["drawn_ms"] for one in state["updates"]), "another"
+    )
+    assert window.complaints == []
+
+
+def test_a_server_that_comes_back_is_followed_on(open_page: Callable[..., Window], street: LiveStreet) -> None:
+    with served(street.path, "--connect", street.endpoint) as page:
+        window = open_page(page.url)
+        window.drawn()
+        port = page.port
+    window.until(lambda state: not state["open"], "the line is lost")
+    assert window.tab.locator("#badge").inner_text() == "connecting …"
+    street.merge(street_tile(EAST, wall=True))
+    with served(street.path, "--connect", street.endpoint, "--port", str(port)):
+        window.until(lambda state: state["open"], "the line is back")
+        wanted = len(street_tile(HERE).gaussians) + len(street_tile(EAST, wall=True).gaussians)
+        window.until(lambda state: state["gaussians"] == wanted, "what was missed is there")
+
+
+def test_a_click_tells_what_the_server_knows_of_the_voxel(
+    open_page: Callable[..., Window], street: LiveStreet, page: ServedPage
+) -> None:
+    street.merge(street_tile(HERE, hump=0.3), "vehicle-42")
+    lat, lon = np.degrees(HERE.centre_rad)
+    window = open_page(f"{page.url}#at={lat - 0.00008},{lon - 0.00008},30,20,0,80&colour=height")
+    window.drawn()
+    box = window.tab.locator("#map").bounding_box()
+    window.tab.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    selected = window.until(lambda state: state["selected"] is not None, "something is selected")["selected"]
+    window.tab.locator("#inspectbody .step").first.wait_for(timeout=60_000)
+    story = page.value(f"/api/voxel/{selected['tile']}/{selected['voxel']}?version={selected['version']}")
+    text = window.tab.locator("#inspectbody").inner_text()
+    assert story["path"] in text
+    assert f"{story['gaussian']['points']}" in text
+    assert [step["version"] for step in story["steps"]] == [1, 2]
+    assert "vehicle-42" in text
+    assert "says modified" in text
+    window.tab.keyboard.press("Escape")
+    assert window.state()["selected"] is None
+
+
+def test_before_and_after_show_the_versions_that_the_server_has(
+    open_page: Callable[..., Window], street: LiveStreet, page: ServedPage
+) -> None:
+    street.merge(street_tile(EAST, wall=True))
+    window = open_page(page.url)
+    window.drawn()
+    window.tab.click("#compare")
+    assert window.state()["split"] == 0.5
+    version = "s => s.mesh.visible ? s.loaded.packed.version : 0"
+    shown = f"[...gndPage.tiles.tiles.values()].map(t => [t.info.id, t.slots.map({version})])"
+    told = page.value("/api/tiles?box=-100,-100,100,100")["tiles"]
+    wanted = {one["id"]: [one["versions"][0][0], one["versions"][-1][0]] for one in told}
+    window.until(lambda _: dict(window.tab.evaluate(shown)) == wanted, "both versions are shown")
+    window.tab.focus("#divider")
+    window.tab.keyboard.press("ArrowLeft")
+    assert window.state()["split"] == pytest.approx(0.48)
+    window.tab.locator("#after").fill("0")
+    first = {one["id"]: [one["versions"][0][0]] * 2 for one in told}
+    window.until(lambda _: dict(window.tab.evaluate(shown)) == first, "then it was as before")
+    window.tab.click("#compare")
+    window.tab.click("#now")
+    assert window.state()["time_ms"] is None or window.state()["time_ms"] == float("inf")
+    assert window.complaints == []
+
+
+def test_the_work_list_flies_to_a_change(
+    open_page: Callable[..., Window], street: LiveStreet, page: ServedPage
+) -> None:
+    street.merge(street_tile(EAST, wall=True))
+    window = open_page(page.url)
+    window.drawn()
+    window.tab.click("#tab-changes")
+    item = window.tab.locator("#changes button.item").first
+    item.wait_for(timeout=60_000)
+    (change,) = page.value("/api/changes")["changes"]
+    assert "New wall" in item.inner_text()
+    item.click()
+    target = "gndPage.view.controls.target.toArray()"
+    window.until(
+        lambda _: np.allclose(window.tab.evaluate(target)[:2], change["at_m"][:2], atol=0.5), "it looks at the change"
+    )
+    for tab in ("fleet", "traffic", "cloud", "view"):
+        window.tab.click(f"#tab-{tab}")
+    assert window.complaints == []
+
+
+def test_names_are_shown_as_they_are_and_never_run(
+    open_page: Callable[..., Window], street: LiveStreet, page: ServedPage, tmp_path: Path
+) -> None:
+    hostile = '<img src=x onerror="window.hacked=1">'
+    window = open_page(page.url)
+    window.drawn()
+    message = {"type": "vehicles", "vehicles": [{"name": hostile, "at": [0, 0, 0, 0], "heading_rad": None,
+               "odometer_m": 1, "health": hostile, "tiles": 0, "reports": 0, "doubts": 0}]}  # fmt: skip
+    window.tab.evaluate("message => gndPage.hear(message)", message)
+    window.tab.click("#tab-fleet")
+    assert hostile in window.tab.locator("#fleet").inner_text()
+    assert window.tab.locator("#fleet img, #labels img").count() == 0
+    report = {"id": "1", "vehicle": hostile, "driven_ms": 0, "says": hostile, "rays": {hostile: 1}}
+    step = {"version": 1, "kind": "merged", "what": hostile, "created_ms": 0, "merger": hostile, "reports": [report]}
+    place = {"tile": 1, "path": hostile, "voxel": 1, "version": 1, "lat_deg": 0, "lon_deg": 0, "height_m": 0}
+    story = place | {"gaussian": None, "steps": [step]}
+    window.tab.route("**/api/voxel/**", lambda route: route.fulfill(json=story))
+    window.tab.evaluate(
+        "gndPage.select({tile: {id: 1}, version: 1, packed: {voxel: [1]}, row: 0, at: gndPage.view.controls.target})"
+    )
+    window.tab.locator("#inspectbody .step").first.wait_for(timeout=60_000)
+    assert hostile in window.tab.locator("#inspectbody").inner_text()
+    assert window.tab.evaluate("document.querySelectorAll('#inspect img').length") == 0
+    assert window.tab.evaluate("window.hacked") is None
+
+
+def test_a_store_with_a_hostile_name_is_a_title_like_any_other(
+    open_page: Callable[..., Window], tmp_path: Path, street: LiveStreet
+) -> None:
+    folder = tmp_path / "<b onclick=alert(1)>map"
+    folder.mkdir()
+    copy = folder / "<script>alert(1)<"
+    street.store.backup(copy)
+    with served(copy) as page:
+        window = open_page(page.url)
+        window.drawn()
+        assert window.tab.locator("#title").inner_text() == copy.name
+        assert window.complaints == []
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+@pytest.mark.parametrize("width", [900, 390])
+def test_axe_finds_nothing(
+    open_page: Callable[..., Window], street: LiveStreet, page: ServedPage, scheme: str, width: int
+) -> None:
+    if not AXE.is_file():
+        pytest.skip("axe-core is not installed: npm ci in page/")
+    street.merge(street_tile(EAST, wall=True))
+    window = open_page(page.url, color_scheme=scheme, bypass_csp=True)
+    window.tab.set_viewport_size({"width": width, "height": 780})
+    window.drawn()
+    assert window.tab.evaluate("document.documentElement.dataset.theme") == scheme
+    window.tab.add_script_tag(content=AXE.read_text(encoding="utf-8"))
+    if width < 800:
+        window.tab.click("#sidebutton")
+    for tab in ("view", "changes", "fleet", "traffic", "cloud"):
+        window.tab.click(f"#tab-{tab}")
+        window.tab.wait_for_timeout(300)
+        found = window.tab.evaluate("axe.run(document, {resultTypes: ['violations']})")
+        told = [(one["id"], [node["html"][:120] for node in one["nodes"]]) for one in found["violations"]]
+        assert told == [], f"{tab}: {told}"
+    assert window.tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing stands out sideways"
+
+
+def test_a_link_leads_to_a_place_and_a_time(
+    open_page: Callable[..., Window], street: LiveStreet, page: ServedPage
+) -> None:
+    street.merge(street_tile(EAST, wall=True))
+    first_ms = page.value("/api/map")["first_ms"]
+    lat, lon = np.degrees(EAST.centre_rad)
+    window = open_page(f"{page.url}#at={lat:.6f},{lon:.6f},30,40,0,50&colour=surface&time={first_ms + 1}")
+    window.drawn()
+    assert window.state()["time_ms"] == first_ms + 1
+    (east,) = (one for one in page.value("/api/tiles?box=-100,-100,100,100")["tiles"] if one["id"] == EAST.morton)
+    target = window.tab.evaluate("gndPage.view.controls.target.toArray()")
+    assert np.allclose(target[:2], east["place"][:2], atol=0.5)
+    assert window.tab.get_attribute("[data-mode=surface]", "aria-checked") == "true"
