@@ -26,6 +26,7 @@ NAMES: Final = (
     "identity-bytes",
     "many-tiles",
     "endings",
+    "page",
 )
 
 

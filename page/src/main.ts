@@ -632,20 +632,22 @@ class Page {
     return { ...drawn, isLoading: this.tiles.isLoading, quality: this.tiles.quality, firstPicture_ms: this.firstPicture_ms, updates: this.updates, selected: this.selected, live: this.isLive, open: this.isOpen, split: this.view.split, time_ms: this.timeline.after_ms, vehicles: [...this.vehicles.known.keys()] };
   }
 
-  async rate(seconds: number, quality: number): Promise<number> {
-    this.tiles.quality = quality;
-    this.rearrange();
+  async rate(seconds: number, near_m: number): Promise<number> {
+    const [quality, usual_m] = [this.tiles.quality, this.tiles.near_m];
     const gl = this.view.renderer.getContext();
     const pixel = new Uint8Array(4);
+    this.tiles.near_m = near_m;
+    this.rearrange();
     const begin = performance.now();
     let n = 0;
     while (performance.now() - begin < 1000 * seconds) {
-      this.tiles.quality = quality;
+      this.tiles.quality = 1;
       this.view.draw();
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // until it is really drawn
       n++;
       await new Promise((resolve) => setTimeout(resolve, 0));
     }
+    [this.tiles.quality, this.tiles.near_m] = [quality, usual_m];
     return (1000 * n) / (performance.now() - begin);
   }
 }

@@ -12,7 +12,9 @@ export async function overview(about: About, group: THREE.Group): Promise<void> 
   const [x, y] = [new Float32Array(bytes, 0, n), new Float32Array(bytes, 4 * n, n)];
   const version = new Uint32Array(bytes, 8 * n, n);
   const square = new THREE.PlaneGeometry(1, 1);
-  const mesh = new THREE.InstancedMesh(square, new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.13, depthWrite: false }), n);
+  // Drawn first, under everything: a street may lie lower than its ground plan.
+  const look = { opacity: 0.13, blending: THREE.CustomBlending, blendSrc: THREE.SrcAlphaFactor, blendDst: THREE.OneMinusSrcAlphaFactor, depthWrite: false, depthTest: false } as const;
+  const mesh = new THREE.InstancedMesh(square, new THREE.MeshBasicMaterial(look), n);
   const [lat] = about.origin_deg;
   const [dy, dx] = [38.2, 38.2 * Math.cos((lat * Math.PI) / 180)];
   const matrix = new THREE.Matrix4();
@@ -95,6 +97,7 @@ export class Vehicles {
       this.labels.append(label);
     }
     (mark.mesh.material as THREE.MeshBasicMaterial).color.set(HEALTH[vehicle.health] ?? palette.health.good);
+    mark.health.hidden = !vehicle.health || vehicle.health === "good";
     mark.health.textContent = vehicle.health && vehicle.health !== "good" ? vehicle.health : "";
     return mark;
   }

@@ -6,7 +6,6 @@ import { palette, rgb, type Shades } from "./colours";
 import { flash, geometryOf, type Looks, meets, paint, paintOne } from "./gaussians";
 import { missing, type Packed, renewed, subset, unpack } from "./packed";
 
-const NEAR_M = 55;
 const FINE_M = 320;
 const REACH_M = 1500;
 const AT_ONCE = 6;
@@ -78,6 +77,8 @@ export class Tiles {
   showGhosts = true;
   /** Below 1 less is drawn finely. */
   quality = 1;
+  /** What is nearer is drawn as ellipsoids. */
+  near_m = 55;
   drawn = { tiles: 0, gaussians: 0 };
   leftOut = 0;
   private wanted: { tile: Tile; version: number; level: number; far: number }[] = [];
@@ -203,7 +204,7 @@ export class Tiles {
 
   private show(tile: Tile, slot: Slot, found: Loaded): void {
     slot.mesh.geometry = found.geometry;
-    const isNear = tile.far < NEAR_M * this.quality && found.packed.level === 0;
+    const isNear = tile.far < this.near_m * this.quality && found.packed.level === 0;
     slot.mesh.material = isNear ? this.looks.ellipsoid : this.looks.disc;
     const { mode, low, high, from_s, now_s } = this.shades;
     const how = `${mode}/${low}/${high}/${from_s}/${mode === "age" ? Math.floor(now_s / 30) : 0}`;

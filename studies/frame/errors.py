@@ -21,3 +21,7 @@ class RealDataError(ReproduceError):
 
 class Stopped(ReproduceError):
     """The run was asked to end early; what is done is kept."""
+
+
+class BrowserError(ReproduceError):
+    """There is no browser to measure in, or the page does not come to what is measured."""

@@ -1,0 +1,206 @@
+"""How fast the page of `gnd serve` is in a real browser with software GL: first picture, updates, frames, a city."""
+
+import gzip
+import json
+import shutil
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from gnd.deploy.chaos.street import read_street
+from gnd.deploy.serve.app import PAGE
+from gnd.deploy.serve.command import PageSource, serve_page
+from gnd.deploy.serve.guard import PageAddress
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import update_key
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.sqlite_store import SqliteStore
+from studies.frame.errors import BrowserError
+from studies.frame.measure import Figure
+from studies.frame.options import check, option
+
+SOFTWARE_GL: Final = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+WINDOW: Final = {"width": 1280, "height": 800}
+_PATIENCE_S: Final = 600.0
+_BATCH: Final = 2_000
+
+
+@dataclass(frozen=True, slots=True)
+class PageOptions:
+    """How much is shown, and how long it is looked at."""
+
+    gaussians: int = option(50_000, "Ellipsoids in view.", span=(1_000, 1_000_000))
+    tiles: int = option(100_000, "Tiles of the city; 0: no city.", span=(0, 1_000_000))
+    updates: int = option(40, "Versions published while the page looks on.", span=(1, 10_000))
+    seconds: float = option(5.0, "So long frames are counted.", span=(0.5, 600))
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+OPTIONS: Final = PageOptions
+
+
+def run(options: PageOptions | None = None) -> list[Figure]:
+    """Measure in Chromium."""
+    options = options or PageOptions()
+    with tempfile.TemporaryDirectory() as name, _browser() as browser:
+        found = [_size(), *_street(browser, Path(name), options)]
+        return [*found, *_city(browser, Path(name), options)] if options.tiles else found
+
+
+def _size() -> Figure:
+    folder = files("gnd.deploy.serve") / "page"
+    sizes = [len(gzip.compress((folder / name).read_bytes(), 9)) for name in PAGE]
+    return Figure("the page's own bytes", sum(sizes) / 1000, "kB", "in gzip")
+
+
+@contextmanager
+def _browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright  # for developers alone
+
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    if program is None:
+        raise BrowserError("no chromium is installed: apt-get install chromium")
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=program, args=list(SOFTWARE_GL))
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def _served(source: PageSource) -> Iterator[str]:
+    """The address of the page, served by threads of this process."""
+    stop, found = threading.Event(), list[str]()
+    thread = threading.Thread(target=serve_page, args=(source, PageAddress(), stop, found.append))
+    thread.start()
+    while thread.is_alive() and not found:
+        time.sleep(0.01)
+    try:
+        yield found[0]
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _moved(tile: Tile, to: TileId) -> Tile:
+    """The same Gaussians in another tile of the same row."""
+    return replace(tile, tile_id=to)
+
+
+def _row(tile: Tile, n: int) -> Iterator[Tile]:
+    """So many tiles: a row of copies, and rows above it while voxels have the same numbers there."""
+    begin = tile.tile_id
+    wide = max(1, round(n**0.5))
+    for i in range(n):
+        yield _moved(tile, TileId.from_indices(begin.lon_index + i % wide, begin.lat_index + i // wide))
+
+
+def _street(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
+    """First picture, frames, updates of a map with so many ellipsoids in view."""
+    some = max(read_street().tiles, key=lambda one: len(one.gaussians))
+    n = -(-options.gaussians // len(some.gaussians))
+    path, endpoint = folder / "street.sqlite", "tcp/127.0.0.1:27447"
+    with ExitStack() as stack:
+        stack.enter_context(open_router((endpoint,)))
+        store = stack.enter_context(SqliteStore(path))
+        bus = stack.enter_context(open_bus(BusConfig(connect=(endpoint,)), name="study"))
+        store.put_tiles(list(_row(some, n)))
+        url = stack.enter_context(_served(PageSource(path, connect=endpoint)))
+        tab = browser.new_page(viewport=WINDOW)
+        begin_s = time.monotonic()
+        tab.goto(url)
+        _until(tab, "gndPage.firstPicture_ms > 0")
+        picture_s = time.monotonic() - begin_s
+        _until(tab, f"!gndPage.state.isLoading && gndPage.state.gaussians >= {options.gaussians}")
+        shown = int(tab.evaluate("gndPage.state.gaussians"))
+        return [
+            Figure("first picture after the page was asked for", picture_s, "s", f"{shown} Gaussians"),
+            *_frames(tab, shown, options.seconds),
+            *_updates(tab, store, bus, some, options.updates),
+        ]
+
+
+def _frames(tab: Any, shown: int, seconds: float) -> list[Figure]:
+    """Frames a second: all as ellipsoids, all as discs, and near and far as the page draws them."""
+    told = f"{WINDOW['width']} x {WINDOW['height']}, {shown} Gaussians"
+    usual_m = float(tab.evaluate("gndPage.tiles.near_m"))
+    kinds = (("all as ellipsoids", 1e6), ("near as ellipsoids, far as discs", usual_m), ("all as discs", 0.0))
+    found = []
+    for name, near_m in kinds:
+        rate = float(tab.evaluate(f"gndPage.rate({seconds}, {near_m})"))
+        found.append(Figure(f"frames, {name}", rate, "1/s", told))
+    return found
+
+
+def _updates(tab: Any, store: SqliteStore, bus: Bus, some: Tile, n: int) -> list[Figure]:
+    """From publication (the version's own time) to the frame that shows it."""
+    tab.evaluate("gndPage.tiles.quality = 1")
+    known = len(tab.evaluate("gndPage.updates"))
+    g = some.gaussians
+    for number in range(n):
+        lifted = g.mean_m.copy()
+        lifted[: len(g) // 20, 2] = 0.01 * (number % 50)
+        changed = Gaussians(g.voxel_id, g.count, g.cells, lifted, g.cov_m2)
+        (done,) = store.put_tiles([replace(some, gaussians=changed)])
+        new, old = (store.get("ndt", some.tile_id, one) for one in (done.version, done.version - 1))
+        if new is None or old is None:
+            raise BrowserError(f"version {done.version} is not in the store")
+        update = TileUpdate(some.tile_id, "ndt", new.version, old.version, new.sha, old.sha, "base")
+        bus.publish(update_key("ndt", some.tile_id), update.encode(), kind="update")
+        _until(tab, f"gndPage.updates.length > {known + number} && gndPage.updates.at(-1).drawn_ms > 0")
+    told = tab.evaluate("gndPage.updates")[known:]
+    drawn_s = [(one["drawn_ms"] - one["created_ms"]) / 1000 for one in told if one["drawn_ms"]]
+    detail = f"{len(drawn_s)} updates of {len(g)} Gaussians"
+    return [
+        Figure("published to drawn, median", statistics.median(drawn_s), "s", detail),
+        Figure("published to drawn, 95 %", float(np.quantile(drawn_s, 0.95)), "s", detail),
+    ]
+
+
+def _city(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
+    """A city of small tiles: when the page can be used, and what its first answers weigh."""
+    some = min(read_street().tiles, key=lambda one: len(one.gaussians))
+    few = Tile(some.tile_id, 0, some.gaussians.take(np.arange(min(24, len(some.gaussians)))))
+    path = folder / "city.sqlite"
+    with SqliteStore(path) as store:
+        rows = list(_row(few, options.tiles))
+        for first in range(0, len(rows), _BATCH):
+            store.put_tiles(rows[first : first + _BATCH])
+    begin_s = time.monotonic()
+    with _served(PageSource(path)) as url:
+        ready_s = time.monotonic() - begin_s
+        tab = browser.new_page(viewport=WINDOW)
+        begin_s = time.monotonic()
+        tab.goto(url)
+        _until(tab, "gndPage.firstPicture_ms > 0 && !gndPage.state.isLoading")
+        usable_s = time.monotonic() - begin_s
+        sizes = tab.evaluate("JSON.stringify(performance.getEntriesByType('resource').map(one => one.encodedBodySize))")
+    told = f"{options.tiles} tiles"
+    return [
+        Figure("city: the server answers after", ready_s, "s", told),
+        Figure("city: first picture, and all in view loaded", usable_s, "s", told),
+        Figure("city: bytes until then", sum(json.loads(sizes)) / 1000, "kB", told),
+    ]
+
+
+def _until(tab: Any, holds: str) -> None:
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not tab.evaluate(f"!!window.gndPage && ({holds})"):
+        if time.monotonic() > deadline_s:
+            raise BrowserError(f"not within {_PATIENCE_S:.0f} s: {holds}")
+        tab.wait_for_timeout(10)
