@@ -1,5 +1,6 @@
-// Gaussians on the GPU: two triangles each. Near ones are ellipsoids that the fragment shader meets with the ray of its
-// pixel, far ones discs along their two longest axes.
+// Gaussians on the GPU: a triangle each, whose corners read their Gaussian from a texture. (Instances would say the same,
+// but software GL draws each instance by itself, many times slower.) Near ones are ellipsoids
+// that the fragment shader meets with the ray of its pixel, far ones discs along their two longest axes.
 
 import * as THREE from "three";
 import { colourOf, type Shades } from "./colours";
@@ -9,9 +10,28 @@ const FULL_M = 65535 * METRES_PER_STEP;
 export const SIGMAS = 2.0;
 export const FLASH_S = 2.5;
 
+const ROW = 1024; // texels; two a Gaussian
+
 const COMMON = /* glsl */ `
-  in vec3 aMean; in vec4 aTurn; in vec4 aShape; in vec4 aColour; in float aFlash;
-  uniform float uTime; uniform float uGrow; uniform vec3 uFlash;
+  uniform highp usampler2D uData; uniform float uTime; uniform float uFlashAt; uniform vec3 uFlash;
+  struct Gaussian { vec3 mean; vec4 turn; vec3 reach; vec3 colour; };
+  vec2 corner() { // of a triangle around the unit circle
+    int c = gl_VertexID % 3;
+    return c == 0 ? vec2(-1.7320508, -1.0) : c == 1 ? vec2(1.7320508, -1.0) : vec2(0.0, 2.0);
+  }
+  Gaussian own() {
+    int at = (gl_VertexID / 3) * 2;
+    ivec2 texel = ivec2(at % ${ROW}, at / ${ROW});
+    uvec4 a = texelFetch(uData, texel, 0), b = texelFetch(uData, texel + ivec2(1, 0), 0);
+    vec4 colour = vec4(uvec4(a.w, a.w >> 8, a.w >> 16, a.w >> 24) & 255u) / 255.0;
+    float glow = colour.a > 0.5 ? clamp(1.0 - (uTime - uFlashAt) / ${FLASH_S.toFixed(1)}, 0.0, 1.0) : 0.0;
+    vec3 sd = vec3(unpackUnorm2x16(b.z), unpackUnorm2x16(b.w).x) * ${FULL_M.toFixed(5)};
+    return Gaussian(
+      uintBitsToFloat(a.xyz),
+      vec4(unpackSnorm2x16(b.x), unpackSnorm2x16(b.y)),
+      max(sd * ${SIGMAS.toFixed(1)}, vec3(0.05, 0.05, 0.02)),
+      mix(colour.rgb, uFlash, glow * 0.85));
+  }
   mat3 axes(vec4 raw) {
     vec4 q = raw / length(raw);
     vec3 x = q.xyz + q.xyz; vec3 d = q.xyz * x; vec3 w = q.w * x;
@@ -19,11 +39,6 @@ const COMMON = /* glsl */ `
     return mat3(1.0 - d.y - d.z, xy + w.z, xz - w.y,
                 xy - w.z, 1.0 - d.x - d.z, yz + w.x,
                 xz + w.y, yz - w.x, 1.0 - d.x - d.y);
-  }
-  vec3 halfAxes() { return max(aShape.xyz * ${FULL_M.toFixed(5)} * ${SIGMAS.toFixed(1)}, vec3(0.05, 0.05, 0.02)); }
-  vec3 lit(vec3 colour) {
-    float glow = aFlash > 0.0 ? clamp(1.0 - (uTime - aFlash) / ${FLASH_S.toFixed(1)}, 0.0, 1.0) : 0.0;
-    return mix(colour, uFlash, glow * 0.85);
   }
 `;
 
@@ -42,17 +57,18 @@ const DISC_VERTEX = /* glsl */ `
   ${COMMON}
   out vec2 vCorner; out vec3 vColour; out vec3 vNormal;
   void main() {
-    mat3 R = axes(aTurn); vec3 s = halfAxes() * uGrow;
+    Gaussian g = own();
+    mat3 R = axes(g.turn); vec3 s = g.reach; vec2 at = corner();
     mat3 toView = mat3(modelViewMatrix);
     vec3 n = normalize(toView * R[2]);
     vec3 a = toView * R[0] * s.x, b = toView * R[1] * s.y;
-    vec4 centre = modelViewMatrix * vec4(aMean, 1.0);
+    vec4 centre = modelViewMatrix * vec4(g.mean, 1.0);
     if (s.z > 0.4 * s.x) { // round ones face the viewer
       float r = (s.x + s.y + s.z) / 3.0; a = vec3(r, 0.0, 0.0); b = vec3(0.0, r, 0.0); n = vec3(0.0, 0.35, 0.94);
     }
     if (dot(n, centre.xyz) > 0.0) n = -n;
-    vCorner = position.xy; vColour = lit(aColour.rgb); vNormal = n;
-    gl_Position = projectionMatrix * (centre + vec4(position.x * a + position.y * b, 0.0));
+    vCorner = at; vColour = g.colour; vNormal = n;
+    gl_Position = projectionMatrix * (centre + vec4(at.x * a + at.y * b, 0.0));
   }
 `;
 
@@ -71,22 +87,23 @@ const ELLIPSOID_VERTEX = /* glsl */ `
   ${COMMON}
   out vec3 vAt; out vec3 vRay; flat out vec3 vEye; flat out vec3 vColour; flat out mat3 vBack;
   void main() {
-    vec3 s = halfAxes() * uGrow;
-    mat3 V = mat3(modelViewMatrix) * axes(aTurn);
+    Gaussian g = own();
+    vec3 s = g.reach;
+    mat3 V = mat3(modelViewMatrix) * axes(g.turn);
     mat3 M = mat3(V[0] * s.x, V[1] * s.y, V[2] * s.z);
-    vec3 c = (modelViewMatrix * vec4(aMean, 1.0)).xyz;
-    vec3 reach = sqrt(vec3(
-      M[0].x * M[0].x + M[1].x * M[1].x + M[2].x * M[2].x,
-      M[0].y * M[0].y + M[1].y * M[1].y + M[2].y * M[2].y,
-      M[0].z * M[0].z + M[1].z * M[1].z + M[2].z * M[2].z));
-    // A plane before the ellipsoid, around the ray to its middle: wide enough for what is seen aslant.
-    float nearer = min((c.z + reach.z) / c.z, 1.0);
-    vec2 wide = reach.xy + abs(c.xy / c.z) * reach.z;
-    vec3 at = vec3(c.xy * nearer + position.xy * wide, c.z * nearer);
+    vec3 c = (modelViewMatrix * vec4(g.mean, 1.0)).xyz;
+    // What the ellipsoid covers of the plane through its middle: an ellipse, as a map of the unit circle (Cholesky).
+    vec2 slant = c.xy / c.z;
+    vec3 p = vec3(M[0].x, M[1].x, M[2].x) - slant.x * vec3(M[0].z, M[1].z, M[2].z);
+    vec3 q = vec3(M[0].y, M[1].y, M[2].y) - slant.y * vec3(M[0].z, M[1].z, M[2].z);
+    float l = length(p), m = dot(p, q) / l, n = sqrt(max(dot(q, q) - m * m, 1e-8));
+    float wide = s.x / length(c), grow = 1.02 * inversesqrt(max(1.0 - wide * wide, 0.1));
+    vec2 at2 = corner() * grow;
+    vec3 at = c + vec3(l * at2.x, m * at2.x + n * at2.y, 0.0);
     if (at.z > -0.05) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
     mat3 inverseM = transpose(mat3(V[0] / s.x, V[1] / s.y, V[2] / s.z));
     vBack = transpose(inverseM); vEye = inverseM * -c; vRay = inverseM * at; vAt = at;
-    vColour = lit(aColour.rgb);
+    vColour = g.colour;
     gl_Position = projectionMatrix * vec4(at, 1.0);
   }
 `;
@@ -124,7 +141,7 @@ export function looks(): Looks {
       glslVersion: THREE.GLSL3,
       vertexShader,
       fragmentShader,
-      uniforms: { ...uniforms, uGhost: { value: ghost }, uGrow: { value: 1 } },
+      uniforms: { ...uniforms, uGhost: { value: ghost }, uData: { value: null }, uFlashAt: { value: 0 } },
       side: THREE.DoubleSide,
     });
   return {
@@ -135,52 +152,80 @@ export function looks(): Looks {
   };
 }
 
-const CORNERS = new THREE.BufferAttribute(new Float32Array([-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]), 3);
-const INDEX = new THREE.BufferAttribute(new Uint16Array([0, 1, 2, 0, 2, 3]), 1);
+export interface Drawable {
+  geometry: THREE.BufferGeometry;
+  texture: THREE.DataTexture;
+  /** Eight words a Gaussian: mean (3 floats), colour and whether it flashes, turn (2 x 2), shape (2 x 2). */
+  words: Uint32Array;
+  flashAt: number;
+}
 
-/** Columns of a version as instanced attributes. */
-export function geometryOf(p: Packed): THREE.InstancedBufferGeometry {
-  const geometry = new THREE.InstancedBufferGeometry();
-  geometry.setAttribute("position", CORNERS);
-  geometry.setIndex(INDEX);
-  const add = (name: string, array: any, width: number, normalised: boolean) =>
-    geometry.setAttribute(name, new THREE.InstancedBufferAttribute(array, width, normalised));
-  add("aMean", p.mean, 3, false);
-  add("aTurn", p.turn, 4, true);
-  add("aShape", p.shape, 4, true);
-  add("aColour", new Uint8Array(4 * p.n), 4, true);
-  add("aFlash", new Float32Array(p.n), 1, false);
-  geometry.instanceCount = p.n;
+/** The columns of a version as a texture. */
+export function drawableOf(p: Packed): Drawable {
+  const rows = Math.max(1, Math.ceil((2 * p.n) / ROW));
+  const words = new Uint32Array(4 * ROW * rows);
+  const floats = new Float32Array(words.buffer);
+  const turn = new Uint32Array(p.turn.buffer, p.turn.byteOffset, 2 * p.n);
+  const shape = new Uint32Array(p.shape.buffer, p.shape.byteOffset, 2 * p.n);
+  for (let i = 0; i < p.n; i++) {
+    const at = 8 * i;
+    floats[at] = p.mean[3 * i];
+    floats[at + 1] = p.mean[3 * i + 1];
+    floats[at + 2] = p.mean[3 * i + 2];
+    words[at + 4] = turn[2 * i];
+    words[at + 5] = turn[2 * i + 1];
+    words[at + 6] = shape[2 * i];
+    words[at + 7] = shape[2 * i + 1];
+  }
+  const texture = new THREE.DataTexture(words, ROW, rows, THREE.RGBAIntegerFormat, THREE.UnsignedIntType);
+  texture.internalFormat = "RGBA32UI";
+  texture.needsUpdate = true;
+  const geometry = new THREE.BufferGeometry();
+  geometry.setDrawRange(0, 3 * p.n);
   const middle = p.n ? (p.low + p.high) / 2 : 0;
   const radius = 30 + (p.n ? (p.high - p.low) / 2 : 0);
   geometry.boundingSphere = new THREE.Sphere(new THREE.Vector3(0, 0, middle), radius);
-  return geometry;
+  const drawable = { geometry, texture, words, flashAt: 0 };
+  geometry.userData.drawable = drawable;
+  geometry.addEventListener("dispose", () => texture.dispose());
+  return drawable;
 }
 
-export function paint(geometry: THREE.InstancedBufferGeometry, p: Packed, up_m: number, shades: Shades): void {
-  const attribute = geometry.getAttribute("aColour") as THREE.InstancedBufferAttribute;
-  const into = attribute.array as Uint8Array;
+/** A mesh whose material reads the texture of whatever geometry it has. */
+export function meshOf(geometry: THREE.BufferGeometry, material: THREE.Material): THREE.Mesh {
+  const mesh = new THREE.Mesh(geometry, material);
+  mesh.matrixAutoUpdate = false;
+  mesh.onBeforeRender = (_renderer, _scene, _camera, of, with_) => {
+    const look = with_ as THREE.ShaderMaterial;
+    const drawable = of.userData.drawable as Drawable;
+    look.uniforms.uData.value = drawable.texture;
+    look.uniforms.uFlashAt.value = drawable.flashAt;
+    look.uniformsNeedUpdate = true;
+  };
+  return mesh;
+}
+
+const FLASHES = 0xff000000;
+
+export function paint(drawable: Drawable, p: Packed, up_m: number, shades: Shades): void {
+  const { words } = drawable;
   for (let i = 0; i < p.n; i++) {
     const [r, g, b] = colourOf(p, i, up_m, shades);
-    into[4 * i] = r;
-    into[4 * i + 1] = g;
-    into[4 * i + 2] = b;
-    into[4 * i + 3] = 255;
+    words[8 * i + 3] = ((words[8 * i + 3] & FLASHES) | (Math.round(b) << 16) | (Math.round(g) << 8) | Math.round(r)) >>> 0;
   }
-  attribute.needsUpdate = true;
+  drawable.texture.needsUpdate = true;
 }
 
-export function paintOne(geometry: THREE.InstancedBufferGeometry, colour: [number, number, number]): void {
-  const attribute = geometry.getAttribute("aColour") as THREE.InstancedBufferAttribute;
-  const into = attribute.array as Uint8Array;
-  for (let i = 0; i < into.length; i += 4) into.set([...colour, 255], i);
-  attribute.needsUpdate = true;
+export function paintOne(drawable: Drawable, n: number, [r, g, b]: [number, number, number]): void {
+  for (let i = 0; i < n; i++) drawable.words[8 * i + 3] = ((b << 16) | (g << 8) | r) >>> 0;
+  drawable.texture.needsUpdate = true;
 }
 
-export function flash(geometry: THREE.InstancedBufferGeometry, rows: number[], now_s: number): void {
-  const attribute = geometry.getAttribute("aFlash") as THREE.InstancedBufferAttribute;
-  for (const row of rows) (attribute.array as Float32Array)[row] = now_s;
-  attribute.needsUpdate = true;
+/** Lets some rows flash from now on. */
+export function flash(drawable: Drawable, rows: number[], now_s: number): void {
+  for (const row of rows) drawable.words[8 * row + 3] = (drawable.words[8 * row + 3] | FLASHES) >>> 0;
+  drawable.flashAt = now_s;
+  drawable.texture.needsUpdate = true;
 }
 
 /** The nearest Gaussian that a ray meets, in the tile's frame; the distance along the ray, or null. */

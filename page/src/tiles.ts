@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { ask, askBytes, type About, type TileInfo } from "./api";
 import { palette, rgb, type Shades } from "./colours";
-import { flash, geometryOf, type Looks, meets, paint, paintOne } from "./gaussians";
+import { type Drawable, drawableOf, flash, type Looks, meets, meshOf, paint, paintOne } from "./gaussians";
 import { missing, type Packed, renewed, subset, unpack } from "./packed";
 
 const FINE_M = 320;
@@ -14,7 +14,7 @@ const GHOST_S = 3.0;
 
 interface Loaded {
   packed: Packed;
-  geometry: THREE.InstancedBufferGeometry;
+  drawable: Drawable;
   painted: string;
 }
 
@@ -44,8 +44,7 @@ class Tile {
     this.matrix = new THREE.Matrix4().set(t[0], t[1], t[2], x, t[3], t[4], t[5], y, t[6], t[7], t[8], z, 0, 0, 0, 1);
     this.centre = new THREE.Vector3(x, y, z + ground_m);
     this.slots = groups.map((group) => {
-      const mesh = new THREE.Mesh(new THREE.InstancedBufferGeometry(), looks.disc);
-      mesh.matrixAutoUpdate = false;
+      const mesh = meshOf(new THREE.BufferGeometry(), looks.disc);
       mesh.matrix.copy(this.matrix);
       mesh.visible = false;
       group.add(mesh);
@@ -150,7 +149,7 @@ export class Tiles {
     try {
       const [old, now] = await Promise.all([before ? this.load(known, before, 0) : null, this.load(known, info.version, 0)]);
       const now_s = performance.now() / 1000;
-      flash(now.geometry, old ? renewed(old.packed, now.packed) : [...Array(now.packed.n).keys()], now_s);
+      flash(now.drawable, old ? renewed(old.packed, now.packed) : [...Array(now.packed.n).keys()], now_s);
       if (old) this.leave(known, old.packed, now.packed, now_s + GHOST_S);
     } catch (error) {
       this.trouble(`Version ${info.version} of a tile could not be read: ${(error as Error).message}`);
@@ -203,13 +202,13 @@ export class Tiles {
   }
 
   private show(tile: Tile, slot: Slot, found: Loaded): void {
-    slot.mesh.geometry = found.geometry;
+    slot.mesh.geometry = found.drawable.geometry;
     const isNear = tile.far < this.near_m * this.quality && found.packed.level === 0;
     slot.mesh.material = isNear ? this.looks.ellipsoid : this.looks.disc;
     const { mode, low, high, from_s, now_s } = this.shades;
     const how = `${mode}/${low}/${high}/${from_s}/${mode === "age" ? Math.floor(now_s / 30) : 0}`;
     if (found.painted !== how) {
-      paint(found.geometry, found.packed, tile.info.place[2], this.shades);
+      paint(found.drawable, found.packed, tile.info.place[2], this.shades);
       found.painted = how;
     }
   }
@@ -239,10 +238,9 @@ export class Tiles {
 
   private makeGhost(tile: Tile, old: Packed, now: Packed, of: string, until_s: number): void {
     const gone = subset(old, missing(old, now));
-    const geometry = geometryOf(gone);
-    paintOne(geometry, rgb(palette.change.removed));
-    const mesh = new THREE.Mesh(geometry, this.looks.ghost);
-    mesh.matrixAutoUpdate = false;
+    const drawable = drawableOf(gone);
+    paintOne(drawable, gone.n, rgb(palette.change.removed));
+    const mesh = meshOf(drawable.geometry, this.looks.ghost);
     mesh.matrix.copy(tile.matrix);
     this.ghosts.add(mesh);
     tile.ghost = { mesh, of, until_s };
@@ -281,7 +279,7 @@ export class Tiles {
     this.underway.add(name);
     try {
       const packed = unpack(await askBytes(`tiles/${tile.info.id}/${version}.bin?level=${level}&map=${this.about.key}`));
-      const loaded = tile.loaded.get(place) ?? { packed, geometry: geometryOf(packed), painted: "" };
+      const loaded = tile.loaded.get(place) ?? { packed, drawable: drawableOf(packed), painted: "" };
       tile.loaded.set(place, loaded);
       this.failed.delete(name);
       return loaded;
@@ -302,7 +300,7 @@ export class Tiles {
         held += one.packed.n;
         const isShown = tile.slots.some((slot) => slot.loaded === one);
         if (held > MOST_GAUSSIANS && !isShown) {
-          one.geometry.dispose();
+          one.drawable.geometry.dispose();
           tile.loaded.delete(place);
         }
       }

@@ -151,7 +151,7 @@ def test_a_click_tells_what_the_server_knows_of_the_voxel(
 ) -> None:
     street.merge(street_tile(HERE, hump=0.3), "vehicle-42")
     lat, lon = np.degrees(HERE.centre_rad)
-    window = open_page(f"{page.url}#at={lat - 0.00008},{lon - 0.00008},30,20,0,80&colour=height")
+    window = open_page(f"{page.url}#at={lat - 0.000143},{lon - 0.00006},30,20,0,80&colour=height")
     window.drawn()
     box = window.tab.locator("#map").bounding_box()
     window.tab.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
