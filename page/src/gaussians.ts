@@ -1,6 +1,6 @@
-// Gaussians on the GPU: a triangle each, whose corners read their Gaussian from a texture. (Instances would say the same,
-// but software GL draws each instance by itself, many times slower.) Near ones are ellipsoids
-// that the fragment shader meets with the ray of its pixel, far ones discs along their two longest axes.
+// Gaussians on the GPU: a triangle each. Far ones are discs along their two longest axes, whose corners are computed once;
+// near ones are ellipsoids, which the fragment shader meets with the ray of its pixel, and whose corners read their
+// Gaussian from a texture. (Instances would say the same, but software GL draws each by itself, many times slower.)
 
 import * as THREE from "three";
 import { colourOf, type Shades } from "./colours";
@@ -12,13 +12,17 @@ export const FLASH_S = 2.5;
 
 const ROW = 1024; // texels; two a Gaussian
 
-const COMMON = /* glsl */ `
-  uniform highp usampler2D uData; uniform float uTime; uniform float uFlashAt; uniform vec3 uFlash;
-  struct Gaussian { vec3 mean; vec4 turn; vec3 reach; vec3 colour; };
+const CORNER = /* glsl */ `
   vec2 corner() { // of a triangle around the unit circle
     int c = gl_VertexID % 3;
     return c == 0 ? vec2(-1.7320508, -1.0) : c == 1 ? vec2(1.7320508, -1.0) : vec2(0.0, 2.0);
   }
+`;
+
+const COMMON = /* glsl */ `
+  uniform highp usampler2D uData; uniform float uTime; uniform float uFlashAt; uniform vec3 uFlash;
+  struct Gaussian { vec3 mean; vec4 turn; vec3 reach; vec3 colour; };
+  ${CORNER}
   Gaussian own() {
     int at = (gl_VertexID / 3) * 2;
     ivec2 texel = ivec2(at % ${ROW}, at / ${ROW});
@@ -42,50 +46,50 @@ const COMMON = /* glsl */ `
   }
 `;
 
-const SHADE = /* glsl */ `
-  uniform float uGhost;
+const LIGHT = /* glsl */ `
   vec3 shaded(vec3 colour, vec3 n) {
     float light = 0.58 + 0.30 * max(dot(n, normalize(vec3(0.25, 0.55, 0.8))), 0.0) + 0.14 * max(n.y, 0.0);
     return colour * light;
   }
+`;
+
+const SHADE = /* glsl */ `
+  uniform float uGhost;
   void stipple() {
     if (uGhost > 0.0 && mod(floor(gl_FragCoord.x) + floor(gl_FragCoord.y), 2.0) > 0.5) discard;
   }
 `;
 
 const DISC_VERTEX = /* glsl */ `
-  ${COMMON}
-  out vec2 vCorner; out vec3 vColour; out vec3 vNormal;
+  in vec3 aNormal; in vec4 aColour;
+  uniform float uTime; uniform float uFlashAt; uniform vec3 uFlash;
+  out vec2 vCorner; flat out vec3 vColour;
+  ${CORNER}
+  ${LIGHT}
   void main() {
-    Gaussian g = own();
-    mat3 R = axes(g.turn); vec3 s = g.reach; vec2 at = corner();
-    mat3 toView = mat3(modelViewMatrix);
-    vec3 n = normalize(toView * R[2]);
-    vec3 a = toView * R[0] * s.x, b = toView * R[1] * s.y;
-    vec4 centre = modelViewMatrix * vec4(g.mean, 1.0);
-    if (s.z > 0.4 * s.x) { // round ones face the viewer
-      float r = (s.x + s.y + s.z) / 3.0; a = vec3(r, 0.0, 0.0); b = vec3(0.0, r, 0.0); n = vec3(0.0, 0.35, 0.94);
-    }
-    if (dot(n, centre.xyz) > 0.0) n = -n;
-    vCorner = at; vColour = g.colour; vNormal = n;
-    gl_Position = projectionMatrix * (centre + vec4(at.x * a + at.y * b, 0.0));
+    vec4 at = modelViewMatrix * vec4(position, 1.0);
+    vec3 n = mat3(modelViewMatrix) * aNormal;
+    float glow = aColour.a > 0.5 ? clamp(1.0 - (uTime - uFlashAt) / ${FLASH_S.toFixed(1)}, 0.0, 1.0) : 0.0;
+    vCorner = corner();
+    vColour = shaded(mix(aColour.rgb, uFlash, glow * 0.85), dot(n, at.xyz) > 0.0 ? -n : n);
+    gl_Position = projectionMatrix * at;
   }
 `;
 
 const DISC_FRAGMENT = /* glsl */ `
   ${SHADE}
-  in vec2 vCorner; in vec3 vColour; in vec3 vNormal;
+  in vec2 vCorner; flat in vec3 vColour;
   out vec4 pixel;
   void main() {
     if (dot(vCorner, vCorner) > 1.0) discard;
     stipple();
-    pixel = vec4(shaded(vColour, vNormal), 1.0);
+    pixel = vec4(vColour, 1.0);
   }
 `;
 
 const ELLIPSOID_VERTEX = /* glsl */ `
   ${COMMON}
-  out vec3 vAt; out vec3 vRay; flat out vec3 vEye; flat out vec3 vColour; flat out mat3 vBack;
+  flat out float vDepth; out vec3 vRay; flat out vec3 vEye; flat out vec3 vColour; flat out mat3 vBack;
   void main() {
     Gaussian g = own();
     vec3 s = g.reach;
@@ -102,7 +106,7 @@ const ELLIPSOID_VERTEX = /* glsl */ `
     vec3 at = c + vec3(l * at2.x, m * at2.x + n * at2.y, 0.0);
     if (at.z > -0.05) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
     mat3 inverseM = transpose(mat3(V[0] / s.x, V[1] / s.y, V[2] / s.z));
-    vBack = transpose(inverseM); vEye = inverseM * -c; vRay = inverseM * at; vAt = at;
+    vBack = transpose(inverseM); vEye = inverseM * -c; vRay = inverseM * at; vDepth = at.z;
     vColour = g.colour;
     gl_Position = projectionMatrix * vec4(at, 1.0);
   }
@@ -110,8 +114,9 @@ const ELLIPSOID_VERTEX = /* glsl */ `
 
 const ELLIPSOID_FRAGMENT = /* glsl */ `
   ${SHADE}
+  ${LIGHT}
   uniform mat4 projectionMatrix;
-  in vec3 vAt; in vec3 vRay; flat in vec3 vEye; flat in vec3 vColour; flat in mat3 vBack;
+  flat in float vDepth; in vec3 vRay; flat in vec3 vEye; flat in vec3 vColour; flat in mat3 vBack;
   out vec4 pixel;
   void main() {
     float a = dot(vRay, vRay), b = dot(vEye, vRay), c = dot(vEye, vEye) - 1.0;
@@ -121,7 +126,7 @@ const ELLIPSOID_FRAGMENT = /* glsl */ `
     if (t <= 0.0) discard;
     stipple();
     vec3 n = normalize(vBack * (vEye + t * vRay));
-    float z = t * vAt.z;
+    float z = t * vDepth;
     gl_FragDepth = 0.5 + 0.5 * (projectionMatrix[2].z * z + projectionMatrix[3].z) / -z;
     pixel = vec4(shaded(vColour, n), 1.0);
   }
@@ -152,80 +157,141 @@ export function looks(): Looks {
   };
 }
 
-export interface Drawable {
-  geometry: THREE.BufferGeometry;
-  texture: THREE.DataTexture;
-  /** Eight words a Gaussian: mean (3 floats), colour and whether it flashes, turn (2 x 2), shape (2 x 2). */
-  words: Uint32Array;
-  flashAt: number;
+const [WEST, EAST] = [-Math.sqrt(3), Math.sqrt(3)];
+const CORNERS = [WEST, -1, EAST, -1, 0, 2];
+const FLASHES = 255;
+
+/** A version as the GPU has it. */
+export class Drawable {
+  readonly discs = new THREE.BufferGeometry();
+  flashAt = 0;
+  private readonly colours: Uint8Array;
+  private texture: THREE.DataTexture | null = null;
+  private words = new Uint32Array(0);
+  private near: THREE.BufferGeometry | null = null;
+
+  constructor(private readonly p: Packed) {
+    const [at, normals] = discsOf(p);
+    this.colours = new Uint8Array(12 * p.n);
+    this.discs.setAttribute("position", new THREE.BufferAttribute(at, 3));
+    this.discs.setAttribute("aNormal", new THREE.BufferAttribute(normals, 4, true));
+    this.discs.setAttribute("aColour", new THREE.BufferAttribute(this.colours, 4, true));
+    this.bound(this.discs);
+  }
+
+  /** For the ellipsoids: made when they are near for the first time. */
+  get ellipsoids(): THREE.BufferGeometry {
+    if (!this.near) {
+      this.words = wordsOf(this.p);
+      this.texture = new THREE.DataTexture(this.words, ROW, this.words.length / (4 * ROW), THREE.RGBAIntegerFormat, THREE.UnsignedIntType);
+      this.texture.internalFormat = "RGBA32UI";
+      this.near = new THREE.BufferGeometry();
+      this.near.setDrawRange(0, 3 * this.p.n);
+      this.bound(this.near);
+      this.toTexture();
+    }
+    return this.near;
+  }
+
+  /** Gives the uniforms of a material what this version has of its own. */
+  lend(uniforms: Record<string, THREE.IUniform>): void {
+    if (uniforms.uData) uniforms.uData.value = this.texture;
+    uniforms.uFlashAt.value = this.flashAt;
+  }
+
+  paint(colour: (row: number) => [number, number, number]): void {
+    for (let i = 0; i < this.p.n; i++) {
+      const [r, g, b] = colour(i);
+      for (let c = 0; c < 3; c++) {
+        this.colours[12 * i + 4 * c] = r;
+        this.colours[12 * i + 4 * c + 1] = g;
+        this.colours[12 * i + 4 * c + 2] = b;
+      }
+    }
+    this.toGpu();
+  }
+
+  /** Lets some rows flash from now on. */
+  flash(rows: number[], now_s: number): void {
+    for (const row of rows) for (let c = 0; c < 3; c++) this.colours[12 * row + 4 * c + 3] = FLASHES;
+    this.flashAt = now_s;
+    this.toGpu();
+  }
+
+  dispose(): void {
+    this.discs.dispose();
+    this.near?.dispose();
+    this.texture?.dispose();
+  }
+
+  private toGpu(): void {
+    this.discs.getAttribute("aColour").needsUpdate = true;
+    if (this.texture) this.toTexture();
+  }
+
+  private toTexture(): void {
+    const colours = new Uint32Array(this.colours.buffer);
+    for (let i = 0; i < this.p.n; i++) this.words[8 * i + 3] = colours[3 * i];
+    this.texture!.needsUpdate = true;
+  }
+
+  private bound(geometry: THREE.BufferGeometry): void {
+    const { n, low, high } = this.p;
+    const middle = new THREE.Vector3(0, 0, n ? (low + high) / 2 : 0);
+    geometry.boundingSphere = new THREE.Sphere(middle, 30 + (n ? (high - low) / 2 : 0));
+    geometry.userData.drawable = this;
+  }
 }
 
-/** The columns of a version as a texture. */
-export function drawableOf(p: Packed): Drawable {
-  const rows = Math.max(1, Math.ceil((2 * p.n) / ROW));
-  const words = new Uint32Array(4 * ROW * rows);
+/** The corners of a triangle around each disc, and its normal at each of them. */
+function discsOf(p: Packed): [Float32Array, Int8Array] {
+  const at = new Float32Array(9 * p.n);
+  const normals = new Int8Array(12 * p.n);
+  for (let i = 0; i < p.n; i++) {
+    const [x, y, z, w] = [p.turn[4 * i] / 32767, p.turn[4 * i + 1] / 32767, p.turn[4 * i + 2] / 32767, p.turn[4 * i + 3] / 32767];
+    const a = Math.max(p.shape[4 * i] * METRES_PER_STEP * SIGMAS, 0.05);
+    const b = Math.max(p.shape[4 * i + 1] * METRES_PER_STEP * SIGMAS, 0.05);
+    const first = [a * (1 - 2 * (y * y + z * z)), a * 2 * (x * y + w * z), a * 2 * (x * z - w * y)];
+    const second = [b * 2 * (x * y - w * z), b * (1 - 2 * (x * x + z * z)), b * 2 * (y * z + w * x)];
+    const third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
+    for (let c = 0; c < 3; c++) {
+      for (let k = 0; k < 3; k++) {
+        at[9 * i + 3 * c + k] = p.mean[3 * i + k] + CORNERS[2 * c] * first[k] + CORNERS[2 * c + 1] * second[k];
+        normals[12 * i + 4 * c + k] = Math.round(127 * third[k]);
+      }
+    }
+  }
+  return [at, normals];
+}
+
+/** Eight words a Gaussian: mean (3 floats), colour, turn (2 x 2), shape (2 x 2); in whole rows of the texture. */
+function wordsOf(p: Packed): Uint32Array<ArrayBuffer> {
+  const words = new Uint32Array(4 * ROW * Math.max(1, Math.ceil((2 * p.n) / ROW)));
   const floats = new Float32Array(words.buffer);
   const turn = new Uint32Array(p.turn.buffer, p.turn.byteOffset, 2 * p.n);
   const shape = new Uint32Array(p.shape.buffer, p.shape.byteOffset, 2 * p.n);
   for (let i = 0; i < p.n; i++) {
-    const at = 8 * i;
-    floats[at] = p.mean[3 * i];
-    floats[at + 1] = p.mean[3 * i + 1];
-    floats[at + 2] = p.mean[3 * i + 2];
-    words[at + 4] = turn[2 * i];
-    words[at + 5] = turn[2 * i + 1];
-    words[at + 6] = shape[2 * i];
-    words[at + 7] = shape[2 * i + 1];
+    floats.set(p.mean.subarray(3 * i, 3 * i + 3), 8 * i);
+    words.set(turn.subarray(2 * i, 2 * i + 2), 8 * i + 4);
+    words.set(shape.subarray(2 * i, 2 * i + 2), 8 * i + 6);
   }
-  const texture = new THREE.DataTexture(words, ROW, rows, THREE.RGBAIntegerFormat, THREE.UnsignedIntType);
-  texture.internalFormat = "RGBA32UI";
-  texture.needsUpdate = true;
-  const geometry = new THREE.BufferGeometry();
-  geometry.setDrawRange(0, 3 * p.n);
-  const middle = p.n ? (p.low + p.high) / 2 : 0;
-  const radius = 30 + (p.n ? (p.high - p.low) / 2 : 0);
-  geometry.boundingSphere = new THREE.Sphere(new THREE.Vector3(0, 0, middle), radius);
-  const drawable = { geometry, texture, words, flashAt: 0 };
-  geometry.userData.drawable = drawable;
-  geometry.addEventListener("dispose", () => texture.dispose());
-  return drawable;
+  return words;
 }
 
-/** A mesh whose material reads the texture of whatever geometry it has. */
+/** A mesh whose material is lent what its geometry has of its own. */
 export function meshOf(geometry: THREE.BufferGeometry, material: THREE.Material): THREE.Mesh {
   const mesh = new THREE.Mesh(geometry, material);
   mesh.matrixAutoUpdate = false;
-  mesh.onBeforeRender = (_renderer, _scene, _camera, of, with_) => {
-    const look = with_ as THREE.ShaderMaterial;
-    const drawable = of.userData.drawable as Drawable;
-    look.uniforms.uData.value = drawable.texture;
-    look.uniforms.uFlashAt.value = drawable.flashAt;
+  mesh.onBeforeRender = (_renderer, _scene, _camera, of, used) => {
+    const look = used as THREE.ShaderMaterial;
+    (of.userData.drawable as Drawable).lend(look.uniforms);
     look.uniformsNeedUpdate = true;
   };
   return mesh;
 }
 
-const FLASHES = 0xff000000;
-
 export function paint(drawable: Drawable, p: Packed, up_m: number, shades: Shades): void {
-  const { words } = drawable;
-  for (let i = 0; i < p.n; i++) {
-    const [r, g, b] = colourOf(p, i, up_m, shades);
-    words[8 * i + 3] = ((words[8 * i + 3] & FLASHES) | (Math.round(b) << 16) | (Math.round(g) << 8) | Math.round(r)) >>> 0;
-  }
-  drawable.texture.needsUpdate = true;
-}
-
-export function paintOne(drawable: Drawable, n: number, [r, g, b]: [number, number, number]): void {
-  for (let i = 0; i < n; i++) drawable.words[8 * i + 3] = ((b << 16) | (g << 8) | r) >>> 0;
-  drawable.texture.needsUpdate = true;
-}
-
-/** Lets some rows flash from now on. */
-export function flash(drawable: Drawable, rows: number[], now_s: number): void {
-  for (const row of rows) drawable.words[8 * row + 3] = (drawable.words[8 * row + 3] | FLASHES) >>> 0;
-  drawable.flashAt = now_s;
-  drawable.texture.needsUpdate = true;
+  drawable.paint((row) => colourOf(p, row, up_m, shades));
 }
 
 /** The nearest Gaussian that a ray meets, in the tile's frame; the distance along the ray, or null. */

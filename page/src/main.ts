@@ -638,6 +638,7 @@ class Page {
     const pixel = new Uint8Array(4);
     this.tiles.near_m = near_m;
     this.rearrange();
+    this.view.isPaused = true;
     const begin = performance.now();
     let n = 0;
     while (performance.now() - begin < 1000 * seconds) {
@@ -647,6 +648,7 @@ class Page {
       n++;
       await new Promise((resolve) => setTimeout(resolve, 0));
     }
+    this.view.isPaused = false;
     [this.tiles.quality, this.tiles.near_m] = [quality, usual_m];
     return (1000 * n) / (performance.now() - begin);
   }

@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { ask, askBytes, type About, type TileInfo } from "./api";
 import { palette, rgb, type Shades } from "./colours";
-import { type Drawable, drawableOf, flash, type Looks, meets, meshOf, paint, paintOne } from "./gaussians";
+import { Drawable, type Looks, meets, meshOf, paint } from "./gaussians";
 import { missing, type Packed, renewed, subset, unpack } from "./packed";
 
 const FINE_M = 320;
@@ -149,7 +149,7 @@ export class Tiles {
     try {
       const [old, now] = await Promise.all([before ? this.load(known, before, 0) : null, this.load(known, info.version, 0)]);
       const now_s = performance.now() / 1000;
-      flash(now.drawable, old ? renewed(old.packed, now.packed) : [...Array(now.packed.n).keys()], now_s);
+      now.drawable.flash(old ? renewed(old.packed, now.packed) : [...Array(now.packed.n).keys()], now_s);
       if (old) this.leave(known, old.packed, now.packed, now_s + GHOST_S);
     } catch (error) {
       this.trouble(`Version ${info.version} of a tile could not be read: ${(error as Error).message}`);
@@ -202,8 +202,8 @@ export class Tiles {
   }
 
   private show(tile: Tile, slot: Slot, found: Loaded): void {
-    slot.mesh.geometry = found.drawable.geometry;
     const isNear = tile.far < this.near_m * this.quality && found.packed.level === 0;
+    slot.mesh.geometry = isNear ? found.drawable.ellipsoids : found.drawable.discs;
     slot.mesh.material = isNear ? this.looks.ellipsoid : this.looks.disc;
     const { mode, low, high, from_s, now_s } = this.shades;
     const how = `${mode}/${low}/${high}/${from_s}/${mode === "age" ? Math.floor(now_s / 30) : 0}`;
@@ -238,9 +238,10 @@ export class Tiles {
 
   private makeGhost(tile: Tile, old: Packed, now: Packed, of: string, until_s: number): void {
     const gone = subset(old, missing(old, now));
-    const drawable = drawableOf(gone);
-    paintOne(drawable, gone.n, rgb(palette.change.removed));
-    const mesh = meshOf(drawable.geometry, this.looks.ghost);
+    const drawable = new Drawable(gone);
+    const colour = rgb(palette.change.removed);
+    drawable.paint(() => colour);
+    const mesh = meshOf(drawable.discs, this.looks.ghost);
     mesh.matrix.copy(tile.matrix);
     this.ghosts.add(mesh);
     tile.ghost = { mesh, of, until_s };
@@ -249,7 +250,7 @@ export class Tiles {
   private dropGhost(tile: Tile): void {
     if (!tile.ghost) return;
     this.ghosts.remove(tile.ghost.mesh);
-    tile.ghost.mesh.geometry.dispose();
+    (tile.ghost.mesh.geometry.userData.drawable as Drawable).dispose();
     tile.ghost = null;
   }
 
@@ -279,7 +280,7 @@ export class Tiles {
     this.underway.add(name);
     try {
       const packed = unpack(await askBytes(`tiles/${tile.info.id}/${version}.bin?level=${level}&map=${this.about.key}`));
-      const loaded = tile.loaded.get(place) ?? { packed, drawable: drawableOf(packed), painted: "" };
+      const loaded = tile.loaded.get(place) ?? { packed, drawable: new Drawable(packed), painted: "" };
       tile.loaded.set(place, loaded);
       this.failed.delete(name);
       return loaded;
@@ -300,7 +301,7 @@ export class Tiles {
         held += one.packed.n;
         const isShown = tile.slots.some((slot) => slot.loaded === one);
         if (held > MOST_GAUSSIANS && !isShown) {
-          one.drawable.geometry.dispose();
+          one.drawable.dispose();
           tile.loaded.delete(place);
         }
       }

@@ -11,6 +11,8 @@ export class View {
   /** Share of the window left of the divider; null: nothing is compared. */
   split: number | null = null;
   frames = 0;
+  /** For measurements: nothing is drawn but by `draw`. */
+  isPaused = false;
   /** Whether somebody has moved the view. */
   isTouched = false;
   private isDirty = true;
@@ -149,7 +151,7 @@ export class View {
     requestAnimationFrame(() => this.loop());
     this.advance();
     const isBusy = performance.now() < this.busyUntil;
-    if (!this.isDirty && !isBusy) return;
+    if (this.isPaused || (!this.isDirty && !isBusy)) return;
     this.isDirty = false;
     this.draw();
   }
