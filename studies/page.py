@@ -121,18 +121,29 @@ def _street(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
         bus = stack.enter_context(open_bus(BusConfig(connect=(endpoint,)), name="study"))
         store.put_tiles(list(_row(some, n)))
         url = stack.enter_context(_served(PageSource(path, connect=endpoint)))
-        tab = browser.new_page(viewport=WINDOW)
+        tab, complaints = _window(browser)
         begin_s = time.monotonic()
         tab.goto(url)
         _until(tab, "gndPage.firstPicture_ms > 0")
         picture_s = time.monotonic() - begin_s
         _until(tab, f"!gndPage.state.isLoading && gndPage.state.gaussians >= {options.gaussians}")
         shown = int(tab.evaluate("gndPage.state.gaussians"))
-        return [
+        found = [
             Figure("first picture after the page was asked for", picture_s, "s", f"{shown} Gaussians"),
             *_frames(tab, shown, options.seconds),
             *_updates(tab, store, bus, some, options.updates),
         ]
+        if complaints:
+            raise BrowserError(f"the page complains {len(complaints)} times, first: {complaints[0]}")
+        return found
+
+
+def _window(browser: Any) -> tuple[Any, list[str]]:
+    """An empty tab, and what is complained of in it later on: a shader that does not compile draws quickly."""
+    tab, complaints = browser.new_page(viewport=WINDOW), list[str]()
+    tab.on("console", lambda one: complaints.append(one.text) if one.type == "error" else None)
+    tab.on("pageerror", lambda error: complaints.append(str(error)))
+    return tab, complaints
 
 
 def _frames(tab: Any, shown: int, seconds: float) -> list[Figure]:

@@ -6,7 +6,7 @@ import { legend, MODES, type Mode, palette, type Shades } from "./colours";
 import { byId, facts, make, many, swatch, when } from "./dom";
 import { looks } from "./gaussians";
 import { Frame } from "./geodesy";
-import { Features, overview, selection, Vehicles } from "./overlays";
+import { Features, Overview, selection, Vehicles } from "./overlays";
 import { changeItems, cloudPanel, fleetItems, trafficPanel, voxelPanel } from "./panels";
 import { type Hit, Tiles } from "./tiles";
 import { Timeline } from "./timeline";
@@ -21,7 +21,7 @@ class Page {
   private readonly view: View;
   private readonly vehicles: Vehicles;
   private readonly features = new Features();
-  private readonly overviewGroup = new THREE.Group();
+  private readonly overview = new Overview();
   private readonly frame: Frame;
   private readonly timeline: Timeline;
   private readonly looks = looks();
@@ -50,7 +50,7 @@ class Page {
     this.vehicles = new Vehicles(byId("labels"));
     const after = [this.tiles.after.group, this.tiles.ghosts];
     this.view = new View(byId("map"), this.tiles.before.group, after, (now_s) => this.onFrame(now_s));
-    this.view.scene.add(this.overviewGroup, this.vehicles.group, this.features.group, this.marker);
+    this.view.scene.add(this.overview.group, this.vehicles.group, this.features.group, this.marker);
     this.timeline = new Timeline(() => this.onTime());
     this.begin();
   }
@@ -71,7 +71,7 @@ class Page {
     this.badge();
     this.startPlace();
     if (about.tiles === 0) this.veil("empty", "This map has no tiles yet. They appear here as soon as there are any.");
-    void this.guarded("The ground plan could not be read", overview(about, this.overviewGroup).then(() => this.view.redraw()));
+    void this.guarded("The ground plan could not be read", this.overview.read(about).then(() => this.view.redraw()));
     void this.guarded("The vehicles could not be read", this.readVehicles());
     follow((message) => this.hear(message), (isOpen, isFirst) => this.onLine(isOpen, isFirst));
     window.setInterval(() => this.refreshPanel(), REFRESH_MS);
@@ -514,7 +514,7 @@ class Page {
     };
     add("Vehicles", true, (isOn) => (this.vehicles.isShown = isOn));
     add("Removed voxels as ghosts", true, (isOn) => (this.tiles.showGhosts = isOn));
-    add("Ground plan of all tiles", true, (isOn) => (this.overviewGroup.visible = isOn));
+    add("Ground plan of all tiles", true, (isOn) => (this.overview.group.visible = isOn));
     for (const layer of this.about.feature_layers) {
       const show = (isOn: boolean) => void this.guarded(`The layer ${layer} could not be read`, this.features.show(layer, isOn).then(() => this.view.redraw()));
       add(layer[0].toUpperCase() + layer.slice(1), true, show);
@@ -529,6 +529,7 @@ class Page {
     this.looks.uniforms.uFlash.value.set(THEMES[theme].flash);
     (this.marker.material as THREE.LineBasicMaterial).color.set(theme === "dark" ? "#ffffff" : "#000000");
     this.view.background(THEMES[theme].map);
+    this.overview.tint(new THREE.Color(THEMES[theme].map));
     this.timeline.marks(this.tiles.times());
   }
 

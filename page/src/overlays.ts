@@ -6,28 +6,39 @@ import { palette } from "./colours";
 import { make } from "./dom";
 
 /** Every tile of the map as a square on the ground: what is seen of a city before its tiles are near. */
-export async function overview(about: About, group: THREE.Group): Promise<void> {
-  const bytes = await askBytes("overview.bin");
-  const n = bytes.byteLength / 16;
-  const [x, y] = [new Float32Array(bytes, 0, n), new Float32Array(bytes, 4 * n, n)];
-  const version = new Uint32Array(bytes, 8 * n, n);
-  const square = new THREE.PlaneGeometry(1, 1);
-  // Drawn first, under everything: a street may lie lower than its ground plan.
-  const look = { opacity: 0.13, blending: THREE.CustomBlending, blendSrc: THREE.SrcAlphaFactor, blendDst: THREE.OneMinusSrcAlphaFactor, depthWrite: false, depthTest: false } as const;
-  const mesh = new THREE.InstancedMesh(square, new THREE.MeshBasicMaterial(look), n);
-  const [lat] = about.origin_deg;
-  const [dy, dx] = [38.2, 38.2 * Math.cos((lat * Math.PI) / 180)];
-  const matrix = new THREE.Matrix4();
-  const [still, changed] = [new THREE.Color(palette.change.surveyed), new THREE.Color(palette.change.new)];
-  for (let i = 0; i < n; i++) {
-    matrix.makeScale(dx * 0.94, dy * 0.94, 1).setPosition(x[i], y[i], about.ground_m - 1.5);
-    mesh.setMatrixAt(i, matrix);
-    mesh.setColorAt(i, version[i] > 1 ? changed : still);
+export class Overview {
+  readonly group = new THREE.Group();
+  private mesh: THREE.InstancedMesh | null = null;
+  private hasChanged: boolean[] = [];
+  private background = new THREE.Color();
+
+  async read(about: About): Promise<void> {
+    const bytes = await askBytes("overview.bin");
+    const n = bytes.byteLength / 16;
+    const [x, y] = [new Float32Array(bytes, 0, n), new Float32Array(bytes, 4 * n, n)];
+    this.hasChanged = [...new Uint32Array(bytes, 8 * n, n)].map((version) => version > 1);
+    // Drawn first, under everything: a street may lie lower than its ground plan.
+    const look = new THREE.MeshBasicMaterial({ depthWrite: false, depthTest: false });
+    this.mesh = new THREE.InstancedMesh(new THREE.PlaneGeometry(1, 1), look, n);
+    const [dy, dx] = [38.2, 38.2 * Math.cos((about.origin_deg[0] * Math.PI) / 180)];
+    const matrix = new THREE.Matrix4();
+    for (let i = 0; i < n; i++) {
+      matrix.makeScale(dx * 0.94, dy * 0.94, 1).setPosition(x[i], y[i], about.ground_m - 1.5);
+      this.mesh.setMatrixAt(i, matrix);
+    }
+    this.mesh.frustumCulled = false;
+    this.mesh.renderOrder = -1;
+    this.group.add(this.mesh);
+    this.tint(this.background);
   }
-  mesh.frustumCulled = false;
-  mesh.renderOrder = -1;
-  group.clear();
-  group.add(mesh);
+
+  /** Little colour on that of the background. */
+  tint(background: THREE.Color): void {
+    this.background = background;
+    const [still, changed] = [palette.change.surveyed, palette.change.new].map((one) => background.clone().lerp(new THREE.Color(one), 0.14));
+    this.hasChanged.forEach((one, i) => this.mesh?.setColorAt(i, one ? changed : still));
+    if (this.mesh?.instanceColor) this.mesh.instanceColor.needsUpdate = true;
+  }
 }
 
 const HEALTH: Record<string, string> = palette.health;
