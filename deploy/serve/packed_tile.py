@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from gnd.deploy.serve.tile_states import TileState
+from gnd.deploy.serve.tile_states import PageTile
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.grid import VoxelGrid
 
@@ -34,7 +34,7 @@ METRES_PER_STEP: Final = 1e-4
 _FULL: Final = 65_535
 
 
-def packed(state: TileState, level: int) -> bytes:
+def packed(state: PageTile, level: int) -> bytes:
     """The bytes of a version at a level of detail."""
     columns = _voxels(state) if level == 0 else _blocks(state)
     voxel_id, mean_m, cov_m2, count, since_s, reports, cells, kind = columns
@@ -59,14 +59,14 @@ def packed(state: TileState, level: int) -> bytes:
 _Columns = tuple[I32 | I64, F64, F64, I64, I64, I64, I64, I64]
 
 
-def _voxels(state: TileState) -> _Columns:
+def _voxels(state: PageTile) -> _Columns:
     g = state.gaussians
     mean_m = VoxelGrid.of(state.tile).centre_m(g.voxel_id) + g.mean_m
     told = (np.asarray(one, np.int64) for one in (g.count, state.since_s, state.reports, g.cells, state.kind))
     return (g.voxel_id, mean_m, g.full_cov(), *told)  # type: ignore[return-value]  # a generator of four
 
 
-def _blocks(state: TileState) -> _Columns:
+def _blocks(state: PageTile) -> _Columns:
     """Blocks of voxels as one Gaussian each: moments add. Of when, by whom and what the latest counts."""
     voxel_id, mean_m, cov_m2, count, since_s, reports, cells, kind = _voxels(state)
     if not len(voxel_id):

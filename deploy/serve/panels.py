@@ -30,7 +30,7 @@ _SHARE: Final = 0.1
 _T = TypeVar("_T")
 
 
-class Remembered(Generic[_T]):
+class KeptAnswer(Generic[_T]):
     """A value that is computed anew when it is asked for and not too young.
 
     Args:
@@ -134,15 +134,15 @@ class Panels:
         changes, traffic, status: each as the function of that name gives it.
     """
 
-    changes: Remembered[dict[str, Any]]
-    traffic: Remembered[dict[str, Any]]
-    status: Remembered[dict[str, Any]]
+    changes: KeptAnswer[dict[str, Any]]
+    traffic: KeptAnswer[dict[str, Any]]
+    status: KeptAnswer[dict[str, Any]]
 
     @classmethod
     def of(cls, shown: PageMap, run: RunFolder | None) -> "Panels":
         """The panels of a map."""
         return cls(
-            Remembered(lambda: changes(shown)),
-            Remembered(lambda: traffic(run)),
-            Remembered(lambda: status(shown.store)),
+            KeptAnswer(lambda: changes(shown)),
+            KeptAnswer(lambda: traffic(run)),
+            KeptAnswer(lambda: status(shown.store)),
         )

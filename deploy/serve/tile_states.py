@@ -23,7 +23,7 @@ AS_SURVEYED, NEW, CHANGED = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TileState:
+class PageTile:
     """A version of a tile.
 
     Attributes:
@@ -55,10 +55,10 @@ class TileStates:
 
     def __init__(self, store: Store, layer: str) -> None:
         self._store, self._layer = store, layer
-        self._kept: OrderedDict[tuple[TileId, int], TileState] = OrderedDict()
+        self._kept: OrderedDict[tuple[TileId, int], PageTile] = OrderedDict()
         self._lock = threading.Lock()
 
-    def state(self, tile: TileId, version: int) -> TileState:
+    def state(self, tile: TileId, version: int) -> PageTile:
         """A version.
 
         Raises:
@@ -70,7 +70,7 @@ class TileStates:
         lines = [line.version for line in self._store.history(self._layer, tile) if line.version <= version]
         if not lines or lines[-1] != version:
             raise UnknownVersion(f"tile {tile} of layer {self._layer!r} has no version {version}")
-        before: TileState | None = None
+        before: PageTile | None = None
         todo: list[int] = []
         for number in reversed(lines[-LONGEST:]):
             before = self._known(tile, number)
@@ -83,7 +83,7 @@ class TileStates:
         assert before is not None
         return before
 
-    def _next(self, tile: TileId, version: int, before: TileState | None) -> TileState:
+    def _next(self, tile: TileId, version: int, before: PageTile | None) -> PageTile:
         stored = self._store.get(self._layer, tile, version)
         if stored is None:
             raise UnknownVersion(f"tile {tile} of layer {self._layer!r} has no version {version}")
@@ -92,24 +92,24 @@ class TileStates:
             return _surveyed(stored, gaussians)
         return _merged(stored, gaussians, before, self._store.voxel_provenance(self._layer, tile, version))
 
-    def _known(self, tile: TileId, version: int) -> TileState | None:
+    def _known(self, tile: TileId, version: int) -> PageTile | None:
         with self._lock:
             found = self._kept.get((tile, version))
             if found is not None:
                 self._kept.move_to_end((tile, version))
             return found
 
-    def _keep(self, state: TileState) -> None:
+    def _keep(self, state: PageTile) -> None:
         with self._lock:
             self._kept[state.tile, state.version] = state
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
 
 
-def _surveyed(stored: StoredTile, gaussians: Gaussians) -> TileState:
+def _surveyed(stored: StoredTile, gaussians: Gaussians) -> PageTile:
     n = len(gaussians)
     measured_ns = stored.surveyed_ns if stored.surveyed_ns is not None else stored.created_ns
-    return TileState(
+    return PageTile(
         stored.tile,
         stored.version,
         gaussians,
@@ -121,8 +121,8 @@ def _surveyed(stored: StoredTile, gaussians: Gaussians) -> TileState:
 
 
 def _merged(
-    stored: StoredTile, gaussians: Gaussians, before: TileState, reports_of: dict[int, tuple[str, ...]]
-) -> TileState:
+    stored: StoredTile, gaussians: Gaussians, before: PageTile, reports_of: dict[int, tuple[str, ...]]
+) -> PageTile:
     """What changed gets the time of this version, all else keeps what was known of it."""
     delta = diff(before.gaussians, gaussians)
     ids = gaussians.voxel_id
@@ -146,4 +146,4 @@ def _merged(
     kind, since_s, since_version, reports = columns
     if len(before.kind):  # what was new once and is changed again is still new since the survey
         kind[is_put & was_there & (before.kind[place] == NEW)] = NEW
-    return TileState(stored.tile, stored.version, gaussians, kind, since_s, since_version, reports)
+    return PageTile(stored.tile, stored.version, gaussians, kind, since_s, since_version, reports)

@@ -26,7 +26,7 @@ COUNTERS: Final = ("blocked_inside", "blocked_outside", "in_empty", "passed_insi
 
 
 @dataclass(frozen=True, slots=True)
-class _Step:
+class _StoryStep:
     """A version in which the voxel changed, and to what."""
 
     stored: StoredTile
@@ -83,7 +83,7 @@ def _gaussian(found: Gaussians) -> dict[str, Any] | None:
     }
 
 
-def _steps(store: Store, layer: str, tile: TileId, voxel: int, newest: int) -> Iterator[_Step]:
+def _steps(store: Store, layer: str, tile: TileId, voxel: int, newest: int) -> Iterator[_StoryStep]:
     before = Gaussians.empty()
     is_first = True
     for line in store.history(layer, tile):
@@ -97,7 +97,7 @@ def _steps(store: Store, layer: str, tile: TileId, voxel: int, newest: int) -> I
         if len(delta.removed) or len(delta.put) or is_first:
             what = "removed" if len(delta.removed) else "changed" if len(before) else "new" if len(now) else "empty"
             reports = store.voxel_provenance(layer, tile, line.version).get(voxel, ())
-            yield _Step(stored, "surveyed" if line.kind == "base" and len(now) else what, reports)
+            yield _StoryStep(stored, "surveyed" if line.kind == "base" and len(now) else what, reports)
         before, is_first = now, False
 
 
@@ -106,7 +106,7 @@ def _rows(store: Store, layer: str, tile: TileId) -> dict[str, ReportRow]:
     return {row.report_id: row for row in store.reports_of_windows(layer, tile, 0, _ALL_WINDOWS, _ALL_WINDOWS)}
 
 
-def _told(step: _Step, rows: dict[str, ReportRow], tile: TileId, voxel: int) -> dict[str, Any]:
+def _told(step: _StoryStep, rows: dict[str, ReportRow], tile: TileId, voxel: int) -> dict[str, Any]:
     stored = step.stored
     return {
         "version": stored.version,

@@ -5,10 +5,12 @@ import { ask, askBytes, type About, type Feature, type Vehicle } from "./api";
 import { palette } from "./colours";
 import { make } from "./dom";
 
-/** Every tile of the map as a square on the ground: what is seen of a city before its tiles are near. */
+const MOST_SQUARES = 6000;
+
+/** Every tile of the map as a square on the ground, of a large map blocks of tiles: what is seen before they are near. */
 export class Overview {
   readonly group = new THREE.Group();
-  private mesh: THREE.InstancedMesh | null = null;
+  private mesh: THREE.Mesh | null = null;
   private hasChanged: boolean[] = [];
   private background = new THREE.Color();
 
@@ -16,18 +18,18 @@ export class Overview {
     const bytes = await askBytes("overview.bin");
     const n = bytes.byteLength / 16;
     const [x, y] = [new Float32Array(bytes, 0, n), new Float32Array(bytes, 4 * n, n)];
-    this.hasChanged = [...new Uint32Array(bytes, 8 * n, n)].map((version) => version > 1);
-    // Drawn first, under everything: a street may lie lower than its ground plan.
-    const look = new THREE.MeshBasicMaterial({ depthWrite: false, depthTest: false });
-    this.mesh = new THREE.InstancedMesh(new THREE.PlaneGeometry(1, 1), look, n);
-    const [dy, dx] = [38.2, 38.2 * Math.cos((about.origin_deg[0] * Math.PI) / 180)];
-    const matrix = new THREE.Matrix4();
+    const version = new Uint32Array(bytes, 8 * n, n);
+    const side = Math.ceil(Math.sqrt(n / MOST_SQUARES));
+    const [dy, dx] = [side * 38.2, side * 38.2 * Math.cos((about.origin_deg[0] * Math.PI) / 180)];
+    const blocks = new Map<string, [number, number, boolean]>();
     for (let i = 0; i < n; i++) {
-      matrix.makeScale(dx * 0.94, dy * 0.94, 1).setPosition(x[i], y[i], about.ground_m - 1.5);
-      this.mesh.setMatrixAt(i, matrix);
+      const [column, row] = side > 1 ? [Math.floor(x[i] / dx), Math.floor(y[i] / dy)] : [i, 0];
+      const known = blocks.get(`${column}/${row}`);
+      const middle = side > 1 ? [(column + 0.5) * dx, (row + 0.5) * dy] : [x[i], y[i]];
+      blocks.set(`${column}/${row}`, [middle[0], middle[1], version[i] > 1 || (known?.[2] ?? false)]);
     }
-    this.mesh.frustumCulled = false;
-    this.mesh.renderOrder = -1;
+    this.hasChanged = [...blocks.values()].map((one) => one[2]);
+    this.mesh = squares([...blocks.values()], 0.47 * dx, 0.47 * dy, about.ground_m - 1.5);
     this.group.add(this.mesh);
     this.tint(this.background);
   }
@@ -36,9 +38,31 @@ export class Overview {
   tint(background: THREE.Color): void {
     this.background = background;
     const [still, changed] = [palette.change.surveyed, palette.change.new].map((one) => background.clone().lerp(new THREE.Color(one), 0.14));
-    this.hasChanged.forEach((one, i) => this.mesh?.setColorAt(i, one ? changed : still));
-    if (this.mesh?.instanceColor) this.mesh.instanceColor.needsUpdate = true;
+    const colours = this.mesh?.geometry.getAttribute("color");
+    if (!colours) return;
+    this.hasChanged.forEach((isOne, i) => {
+      const { r, g, b } = isOne ? changed : still;
+      for (let c = 0; c < 4; c++) colours.setXYZ(4 * i + c, r, g, b);
+    });
+    colours.needsUpdate = true;
   }
+}
+
+function squares(middles: [number, number, boolean][], half_x: number, half_y: number, up: number): THREE.Mesh {
+  const at: number[] = [];
+  const index: number[] = [];
+  middles.forEach(([x, y], i) => {
+    at.push(x - half_x, y - half_y, up, x + half_x, y - half_y, up, x + half_x, y + half_y, up, x - half_x, y + half_y, up);
+    index.push(4 * i, 4 * i + 1, 4 * i + 2, 4 * i, 4 * i + 2, 4 * i + 3);
+  });
+  const geometry = new THREE.BufferGeometry().setIndex(index);
+  geometry.setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
+  geometry.setAttribute("color", new THREE.Float32BufferAttribute(new Float32Array(at.length), 3));
+  // Drawn first, under everything: a street may lie lower than its ground plan.
+  const mesh = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ vertexColors: true, depthWrite: false, depthTest: false }));
+  mesh.frustumCulled = false;
+  mesh.renderOrder = -1;
+  return mesh;
 }
 
 const HEALTH: Record<string, string> = palette.health;

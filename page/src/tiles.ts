@@ -8,7 +8,7 @@ import { missing, type Packed, renewed, subset, unpack } from "./packed";
 
 const FINE_M = 320;
 const REACH_M = 1500;
-const AT_ONCE = 6;
+const AT_ONCE = 8;
 const MOST_GAUSSIANS = 2_500_000;
 const GHOST_S = 3.0;
 
@@ -267,6 +267,7 @@ export class Tiles {
       this.load(tile, version, level)
         .catch((error) => this.trouble(`A tile could not be read: ${error.message}`))
         .finally(() => {
+          this.fetchSome();
           this.changed();
         });
     }
