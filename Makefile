@@ -46,13 +46,14 @@ docs: setup      ## build the documents as a site: build/site/index.html
 
 extras:          ## install each extra alone into an environment of its own, and run what it is for (some three minutes)
 	rm -rf build/extras && mkdir -p build/extras
-	set -e; for extra in sim vehicle cloud client; do $(PYTHON) -m venv build/extras/$$extra; \
+	set -e; for extra in sim vehicle cloud serve client; do $(PYTHON) -m venv build/extras/$$extra; \
 	  build/extras/$$extra/bin/pip install --quiet --disable-pip-version-check -c constraints.txt $$(test $$extra = client && echo . || echo ".[$$extra]"); done
 	cd build/extras && sim/bin/gnd sim world write street.json --seed 11 --length 100
 	cd build/extras && sim/bin/gnd sim drive street.json drive.mcap --sensor vlp16 --cars 0
 	cd build/extras && vehicle/bin/gnd map build -o map.sqlite drive.mcap
 	cd build/extras && vehicle/bin/gnd localise drive.mcap --map map.sqlite --out poses
 	cd build/extras && cloud/bin/gnd merger --help > merger.txt && cloud/bin/gnd map verify map.sqlite
+	cd build/extras && serve/bin/gnd serve --help > serve.txt
 	cd build/extras && client/bin/gnd map info map.sqlite && client/bin/python -c "import gnd; print(len(gnd.Map('map.sqlite').gaussians()))"
 
 bench: setup     ## measure speed beside others who do the same work, on this machine: docs/benchmarks.md

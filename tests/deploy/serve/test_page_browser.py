@@ -291,3 +291,16 @@ def test_a_link_leads_to_a_place_and_a_time(
     target = window.tab.evaluate("gndPage.view.controls.target.toArray()")
     assert np.allclose(target[:2], east["place"][:2], atol=0.5)
     assert window.tab.get_attribute("[data-mode=surface]", "aria-checked") == "true"
+
+
+def test_a_run_is_played_from_its_begin(open_page: Callable[..., Window], street: LiveStreet) -> None:
+    street.merge(street_tile(EAST, wall=True))
+    with served(street.path, "--replay", "0.05") as page:  # the one second that there is takes twenty
+        window = open_page(page.url)
+        first = window.until(lambda state: np.isfinite(state["time_ms"]), "it plays")["time_ms"]
+        assert first < page.value("/api/map")["last_ms"]
+        window.until(lambda state: first < state["time_ms"] < np.inf, "time goes on")
+        window.tab.click("#play")
+        stopped = window.state()["time_ms"]
+        window.tab.wait_for_timeout(500)
+        assert window.state()["time_ms"] == stopped
