@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 import uvicorn
+from starlette.applications import Starlette
 
 from gnd.deploy.errors import ServeError
 from gnd.deploy.interruption import ending_in_order
@@ -107,27 +108,32 @@ def serve_page(
         page_map, hub = PageMap(opened, source.layer, title), BrowserHub()
         vehicles = PageVehicles(source.run, page_map.place, page_map.ground_m)
         panels = Panels.of(page_map, source.run)
-        follower = PageFollower(
-            page_map, vehicles, hub.tell, connect=source.endpoint, run=source.run, status=panels.status.get
-        )
+
+        def status() -> dict[str, Any]:
+            return panels.status.get() if hub.count else {}
+
+        follower = PageFollower(page_map, vehicles, hub.tell, connect=source.endpoint, run=source.run, status=status)
         app = page_app(PageParts(page_map, vehicles, panels, source.replay), hub, follower, address)
         listening = stack.enter_context(_listening(address))
         port = int(listening.getsockname()[1])
-        server = PageServer(
-            uvicorn.Config(
-                app,
-                log_level="warning",
-                access_log=False,
-                ws="websockets-sansio",
-                ws_max_size=SAYS_BYTES,
-                server_header=False,
-                limit_concurrency=MOST_AT_ONCE,
-                timeout_graceful_shutdown=END_S,
-                ssl_certfile=None if address.certificate is None else str(address.certificate),
-                ssl_keyfile=None if address.key is None else str(address.key),
-            )
+        _run(_server_of(app, address), listening, stop, lambda: tell(address.url(port)))
+
+
+def _server_of(app: Starlette, address: PageAddress) -> PageServer:
+    return PageServer(
+        uvicorn.Config(
+            app,
+            log_level="warning",
+            access_log=False,
+            ws="websockets-sansio",
+            ws_max_size=SAYS_BYTES,
+            server_header=False,
+            limit_concurrency=MOST_AT_ONCE,
+            timeout_graceful_shutdown=END_S,
+            ssl_certfile=None if address.certificate is None else str(address.certificate),
+            ssl_keyfile=None if address.key is None else str(address.key),
         )
-        _run(server, listening, stop, lambda: tell(address.url(port)))
+    )
 
 
 def _run(server: PageServer, listening: socket.socket, stop: threading.Event, ready: Callable[[], None]) -> None:

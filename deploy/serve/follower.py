@@ -45,7 +45,7 @@ class PageFollower:
         tell: called with each message.
         connect: endpoint of the fleet's router; None: there is none to listen to.
         run: the folder of the run, whose end is told; None: none.
-        status: how the cloud stands, asked for now and then.
+        status: how the cloud stands, asked for now and then; empty: nobody wants to know.
     """
 
     def __init__(
@@ -167,7 +167,9 @@ class PageFollower:
             self._tell({"type": "ended"})
 
     def _tell_status(self) -> None:
-        self._tell({"type": "status", "status": self._status() | {"live": self.is_live}})
+        status = self._status()
+        if status:
+            self._tell({"type": "status", "status": status | {"live": self.is_live}})
 
     def _on_traffic(self, key: str, payload: bytes) -> None:
         try:

@@ -53,6 +53,7 @@ class HeadTable:
         self._store, self._layer = store, layer
         self._lock, self._reading = threading.Lock(), threading.Lock()
         self.frame = frame or _frame_of(np.array([one.tile.morton for one in store.heads(layer)], np.int64))
+        self._begins_empty = frame is None and not store.heads(layer)
         self._columns = self._read()[0]
 
     @property
@@ -106,6 +107,8 @@ class HeadTable:
                 [one.created_ns for one in lines],
             )
         )
+        if self._begins_empty and len(morton):  # the first tiles of all: the map begins here
+            self.frame, self._begins_empty = _frame_of(morton), False
         if known is not None and np.array_equal(morton, known.morton):
             place_m = known.place_m
             before = known.version

@@ -15,6 +15,7 @@ from websockets.sync.client import ClientConnection, connect
 
 import gnd
 from gnd.gnd_map.tile import diff
+from gnd.tile_store.sqlite_store import SqliteStore
 
 
 @pytest.fixture(scope="module")
@@ -267,3 +268,18 @@ def test_a_store_alone_is_followed_and_ctrl_c_ends_it_at_once(tmp_path: Path) ->
                 assert time.monotonic() - begin_s < 20
         finally:
             page.end()
+
+
+def test_a_map_that_begins_empty_lies_where_its_first_tiles_are(tmp_path: Path) -> None:
+    path = tmp_path / "empty.sqlite"
+    with SqliteStore(path) as store, served(path) as page:
+        about = page.value("/api/map")
+        assert (about["tiles"], about["key"], about["first_ms"]) == (0, "", 0)
+        with socket_of(page) as socket:
+            wait_for(socket, "status")
+            store.put_tiles([street_tile(HERE), street_tile(EAST)])
+            assert wait_for(socket, "update")["before"] == 0
+        about = page.value("/api/map")
+        assert about["tiles"] == 2
+        assert np.allclose(about["origin_deg"], np.degrees(HERE.centre_rad), atol=0.001)
+        assert len(page.value("/api/tiles?box=-100,-100,100,100")["tiles"]) == 2
