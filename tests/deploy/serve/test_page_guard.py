@@ -1,7 +1,11 @@
 """Who may see the page: this machine alone, or whoever brings the token; and a browser that does not keep up."""
 
 import asyncio
+import http.client
 import json
+import shutil
+import ssl
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -105,3 +109,32 @@ def test_there_may_be_so_many_browsers_and_no_more() -> None:
     assert queues[0] is not None
     hub.leave(queues[0])
     assert hub.join() is not None
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_with_a_certificate_it_is_https_and_its_cookie_too(tmp_path: Path) -> None:
+    token, certificate, key = (tmp_path / name for name in ("token", "cert.pem", "key.pem"))
+    token.write_text(TOKEN)
+    token.chmod(0o600)
+    request = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=localhost"]
+    names = ["-addext", "subjectAltName=DNS:localhost", "-keyout", str(key), "-out", str(certificate)]
+    subprocess.run([*request, *names], check=True, capture_output=True)
+    arguments = (
+        "--token-file",
+        str(token),
+        "--certificate",
+        str(certificate),
+        "--key",
+        str(key),
+        "--name",
+        "localhost",
+    )
+    with live_street(tmp_path, router=False) as street, served(street.path, *arguments) as page:
+        assert page.url == f"https://localhost:{page.port}/"
+        trusted = ssl.create_default_context(cafile=str(certificate))
+        connection = http.client.HTTPSConnection("localhost", page.port, context=trusted, timeout=60)
+        connection.request("GET", f"/?token={TOKEN}")
+        answer = connection.getresponse()
+        assert answer.status == 303
+        assert "Secure" in (answer.getheader("set-cookie") or "")
+        connection.close()
