@@ -28,7 +28,7 @@ from gnd.schemas.keys import tile_key, update_keys
 from gnd.schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, tile_after, tile_of
 from gnd.schemas.updates import TileUpdate, updated
 from gnd.vehicle_agent.errors import OutboxError
-from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.outbox import FIRST_ASK_S, Outbox
 from gnd.vehicle_agent.link.sending import SenderThread
 
 REPORTS_OF_TRIP: Final = 6
@@ -83,9 +83,10 @@ class _TimedOutbox(Outbox):
         wanted: bytes = b"",
         *,
         is_short: bool = False,
+        ask_s: float = FIRST_ASK_S,
     ) -> None:
         """As `Outbox.answered`."""
-        super().answered(report_id, status, reason, now_ns, wanted, is_short=is_short)
+        super().answered(report_id, status, reason, now_ns, wanted, is_short=is_short, ask_s=ask_s)
         if self._times is not None and status != "quarantined":
             with self._times.open("a", encoding="utf-8") as file:
                 file.write(f"{time.monotonic():.4f}\n")
