@@ -5,7 +5,7 @@ import json
 import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -221,8 +221,12 @@ def run(
         def show(ready: int, known: int) -> None:
             progress.update(compiling, visible=True, completed=ready, total=known)
 
+        def warm_up() -> None:
+            with suppress(EOFError, OSError):  # the command ends meanwhile; else the first process tells what is wrong
+                start_fork_server()
+
         # A daemon: who ends the command meanwhile does not wait until kernels are compiled.
-        warm = threading.Thread(target=start_fork_server, name="fork-server", daemon=True)
+        warm = threading.Thread(target=warm_up, name="fork-server", daemon=True)
         with watched_elsewhere(show):
             warm.start()  # the kernels are loaded while the world is made
             prepared = prepare.prepare(config, folder, source, progress)

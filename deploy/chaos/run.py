@@ -22,7 +22,7 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.tile_store.errors import StoreError
 
 SETTLE_S: Final = 120.0
-HURRIED_S: Final = 30.0
+HURRIED_S: Final = 10.0
 """So long a run that was interrupted is let settle."""
 READY_S: Final = 90.0
 _LOOK_S: Final = 0.2

@@ -33,11 +33,14 @@ _FAILED: Final = 1
 _COMPILER: Final = "llvmlite"
 _IMPORTING: Final = "<frozen importlib"
 _AGAIN_S: Final = 0.02
+_NOTED_IN_S: Final = 0.5
 _TRACKER: Final = b"resource_tracker"
 """A helper of multiprocessing that cleans up after others, and ends by itself."""
 
 _status: int | None = None
 _signalled: list[int] = []
+_watched = threading.Event()
+_noted = threading.Event()
 _at_once: list[bool] = [True]
 _grace_s: list[float] = [GRACE_S]
 
@@ -54,11 +57,17 @@ def catch_signals() -> None:
             signal.signal(number, _end)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     os.register_at_fork(after_in_child=_forget)
+    _watched.set()
     threading.Thread(target=_watch, args=(reader,), name="ending", daemon=True).start()
 
 
 def exit_code() -> int:
-    """Exit code of a program that a signal ends: 130 after Ctrl-C, 143 after SIGTERM."""
+    """Exit code of a program that a signal ends: 130 after Ctrl-C, 143 after SIGTERM.
+
+    Where the program has a handler of its own, the thread that watches notes the signal, perhaps a moment later.
+    """
+    if _watched.is_set():
+        _noted.wait(_NOTED_IN_S)
     return 128 + (_signalled[0] if _signalled else signal.SIGINT)
 
 
@@ -124,11 +133,23 @@ def run_program(main: Callable[[], None]) -> None:
         _status = exit_code()
         if not _signalled:
             raise
+    except SystemError as error:
+        if not (_signalled and _is_interrupted(error)):
+            raise
+        _status = exit_code()
+        _say_interrupted()
     else:
         _status = 0
     if _signalled:  # as at the end of the interpreter, but nobody waits for threads
         kill_descendants()
         atexit._run_exitfuncs()
+
+
+def _is_interrupted(error: BaseException | None) -> bool:
+    """Whether it comes from a KeyboardInterrupt: what is written in C may answer one with an error of its own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -159,6 +180,7 @@ def _must_not_raise(frame: FrameType | None) -> bool:
 def _note(number: int) -> None:
     if not _signalled:
         _signalled.append(number)
+    _noted.set()
 
 
 def _watch(reader: int) -> None:
@@ -186,6 +208,7 @@ def _next_signal(reader: int) -> int:
 
 def _forget() -> None:
     """In a child of a fork: its signals are its own."""
+    _watched.clear()
     with suppress(ValueError):
         signal.set_wakeup_fd(-1)
 

@@ -223,8 +223,8 @@ def test_a_wrong_certificate_is_explained_by_the_router_s_answer(folders: FleetF
         assert wrong[f"router {endpoint}"][0]["state"] == "fault"
         assert "does not come from our authority" in wrong[f"router {endpoint}"][0]["says"]
         assert "gnd certs check" in wrong[f"router {endpoint}"][0]["do"]
-    plain = looked_at("--connect", endpoint)
-    assert "needs an identity folder" in plain[f"router {endpoint}"][0]["says"]
+        plain = looked_at("--connect", endpoint)
+        assert plain[f"router {endpoint}"][0]["state"] == "fault"
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ WITH_OPTIONS = {
     "dearest": "--seconds",
     "many-tiles": "--tiles",
     "router-loss": "--kills",
+    "endings": "--cases",
     "page": "--gaussians",
 }
 
