@@ -1,6 +1,7 @@
 """Fixtures of databases with empty stores; they skip where there is no server."""
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import count
 
 import pytest
@@ -9,22 +10,29 @@ from postgres_server import FAST, NoServerError, PostgresServer
 _NUMBERS = count()
 
 
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[PostgresServer]:
-    """One server for all tests, with a database `store` that holds an empty store, to be copied."""
+@contextmanager
+def postgres_server() -> Iterator[PostgresServer]:
+    """A server until the end of the block; the test is skipped where there can be none."""
     pytest.importorskip("psycopg", reason="pip install 'gnd-fleet[postgres]'")
-    from gnd.tile_store.postgres_store import PostgresStore
-
     try:
         server = PostgresServer(FAST)
     except NoServerError as error:
         pytest.skip(str(error))
     try:
-        server.sql("CREATE DATABASE store")
-        PostgresStore(server.url("store")).close()
         yield server
     finally:
         server.end()
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[PostgresServer]:
+    """One server for all tests, with a database `store` that holds an empty store, to be copied."""
+    with postgres_server() as server:
+        from gnd.tile_store.postgres_store import PostgresStore
+
+        server.sql("CREATE DATABASE store")
+        PostgresStore(server.url("store")).close()
+        yield server
 
 
 @pytest.fixture

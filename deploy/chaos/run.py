@@ -17,13 +17,14 @@ from gnd.deploy.chaos.inflict import MESSENGER, End, Inflictor
 from gnd.deploy.chaos.service import SERVICES, Gaps, gaps, watched
 from gnd.deploy.chaos.street import read_street
 from gnd.deploy.errors import ChaosError
+from gnd.ending import ORDERLY_S
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.tile_store.errors import StoreError
 
 SETTLE_S: Final = 120.0
-HURRIED_S: Final = 10.0
-"""So long a run that was interrupted is let settle."""
+HURRIED_S: Final = 0.4 * ORDERLY_S
+"""So long a run that was interrupted is let settle: the rest of the grace is for its end."""
 READY_S: Final = 90.0
 _LOOK_S: Final = 0.2
 RETRY_S: Final = 2.0

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from merger_processes import wait_for
 from merger_world import GROUND, TILE, tile_of_states
-from postgres_server import FAST, NoServerError, PostgresServer
+from postgres_fixtures import postgres_server
+from postgres_server import PostgresServer
 
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -29,19 +30,12 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def server() -> Iterator[PostgresServer]:
     """A stopped server with a store in it."""
-    pytest.importorskip("psycopg", reason="pip install 'gnd-fleet[postgres]'")
-    try:
-        server = PostgresServer(FAST)
-    except NoServerError as error:
-        pytest.skip(str(error))
-    try:
+    with postgres_server() as server:
         server.sql("CREATE DATABASE map")
         with open_store(server.url("map")) as store:
             store.put_tiles([tile_of_states({0: GROUND})])
         server.stop()
         yield server
-    finally:
-        server.end()
 
 
 class Part:

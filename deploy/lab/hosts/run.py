@@ -10,6 +10,7 @@ from typing import Final
 
 from gnd.deploy.chaos.checks import Findings, compare_reports, find_stuck, read_outbox, verified
 from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
+from gnd.deploy.chaos.run import HURRIED_S
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.hosts.cloud import LabFolders, client_names, read_times
@@ -28,8 +29,6 @@ BACK_S: Final = 90.0
 """After a fault all regions must be served again within so long."""
 CALM_S: Final = 5.0
 SETTLE_S: Final = 900.0
-HURRIED_S: Final = 45.0
-"""So long a run that was interrupted is let settle."""
 SERVED_LATELY_S: Final = 1.5
 _LOOK_S: Final = 0.2
 
