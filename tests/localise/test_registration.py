@@ -19,10 +19,18 @@ from yard import (
 from gnd.gnd_map.gaussian import full_matrices
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.kernels import linearise, tapered_information
+from gnd.vehicle_agent.localise.kernels import (
+    descend,
+    linearise,
+    newton_step,
+    principal,
+    stand,
+    tapered_information,
+    without_hints,
+)
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import ON_MAP, RegistrationParameters
-from gnd.vehicle_agent.localise.registration import register
+from gnd.vehicle_agent.localise.registration import WHEELS_M, _principal, _solve, register
 
 UNIFORM = 1.0 / 12.0
 
@@ -102,6 +110,100 @@ def test_kernel_equals_its_plain_twin(scene, rng, scale):
     np.testing.assert_allclose(g, g_plain, rtol=1e-9, atol=1e-9 * np.abs(g_plain).max())
     np.testing.assert_allclose(sums, sums_plain, rtol=1e-12)
     assert sums_plain[1] > 100
+
+
+def spectrum(rng, values):
+    """A symmetric matrix (6, 6) with these eigenvalues once its turns are measured at 10 m."""
+    vectors = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    levers = np.array([10.0] * 3 + [1.0] * 3)
+    return (vectors * values) @ vectors.T * levers * levers[:, None]
+
+
+@pytest.mark.parametrize("weak", [0, 1, 3, 6])
+def test_a_step_leaves_out_weak_directions_as_its_plain_twin(rng, weak):
+    least = 10.0 / ON_MAP.degenerate_m**2
+    for _ in range(20):
+        values = least * np.concatenate([rng.uniform(0.0, 0.99, weak), 10.0 ** rng.uniform(0.01, 5.0, 6 - weak)])
+        H, g, step = spectrum(rng, values), rng.normal(size=6) * 100.0, np.empty(6)
+        newton_step(H, g, least, step)
+        plain = _solve(H, g, RegistrationParameters())
+        np.testing.assert_allclose(step, plain, atol=1e-9 * max(np.abs(plain).max(), 1e-12))
+
+
+def test_principal_directions_equal_numpys(rng):
+    for _ in range(20):
+        S = spectrum(rng, 10.0 ** rng.uniform(-3.0, 6.0, 6))
+        values, V = S.copy(), np.empty((6, 6))
+        principal(values, V)
+        np.testing.assert_allclose(np.sort(np.diag(values)), np.linalg.eigvalsh(S), atol=1e-9 * np.abs(S).max())
+        np.testing.assert_allclose((V * np.diag(values)) @ V.T, S, atol=1e-9 * np.abs(S).max())
+
+
+def plain_without_hints(H, share):
+    values, vectors, scale = _principal(H)
+    horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
+    strongest = float(values[horizontal].max(initial=0.0))
+    constrained = ~horizontal | (values > share * strongest)
+    along = vectors[:, constrained]
+    return np.eye(6) if constrained.all() else (along @ along.T) * scale[:, None] / scale
+
+
+def test_hints_are_taken_out_as_by_the_plain_twin(scene, rng):
+    m, T, points = scene
+    H, g, found, taken = np.zeros((6, 6)), np.zeros(6), np.empty((6, 6)), 0
+    for share in (0.01, 0.5, 0.9, 1.1):
+        for start in (T, moved(rng, T, 0.2, 2.0)):
+            R, t = np.ascontiguousarray(start[:3, :3]), np.ascontiguousarray(start[:3, 3])
+            linearise(points, R, t, m.index, m.A, m.b, m.mean_m, m.information, 4.0, 25.0, H, g)
+            plain = plain_without_hints(H, share)
+            assert without_hints(H, share, found) == (not np.array_equal(plain, np.eye(6)))
+            np.testing.assert_allclose(found, plain, atol=1e-9 * np.abs(plain).max())
+            taken += not np.array_equal(plain, np.eye(6))
+    assert taken > 2
+
+
+def test_wheels_tell_height_roll_and_pitch_only(scene):
+    m, T, _ = scene
+    R, t, H, g = T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6)
+    on_ground = stand(WHEELS_M, R, t, m.index, m.A, m.b, m.mean_m, m.information, 10.0, 2.5, 40.0, H, g)
+    H_plain, g_plain, _, matched, _ = plain_linearise(WHEELS_M, R, t, m, 100.0, 625.0)
+    told = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+    assert on_ground == matched == 4
+    np.testing.assert_allclose(H, 40.0 * H_plain * told * told[:, None], atol=1e-9 * np.abs(H_plain).max())
+    np.testing.assert_allclose(g, 40.0 * g_plain * told, atol=1e-9 * np.abs(g_plain).max())
+
+
+@pytest.mark.parametrize("scale", [2.0, 10.0])
+def test_descent_equals_its_plain_twin(scene, rng, scale):
+    """The same steps written out: normal equations, wheels, a step, a turn, until it is small."""
+    m, T, points = scene
+    start, least = moved(rng, T, 0.3, 1.0), 10.0 / ON_MAP.degenerate_m**2
+    rest = (m.index, m.A, m.b, m.mean_m, m.information)
+    R, t = np.ascontiguousarray(start[:3, :3]), np.ascontiguousarray(start[:3, 3])
+    R_plain, t_plain, H, g = R.copy(), t.copy(), np.zeros((6, 6)), np.zeros(6)
+    found = descend(points, WHEELS_M, R, t, *rest, scale, 10.0, 2.5, 40.0, least, 1e-4, 5e-4, 15, 60)
+    for n in range(1, 16):
+        _, matched, inside = linearise(points, R_plain, t_plain, *rest, scale**2, (2.5 * scale) ** 2, H, g)
+        stand(WHEELS_M, R_plain, t_plain, *rest, 10.0, 2.5, 40.0, H, g)
+        step = _solve(H, g, RegistrationParameters())
+        R_plain, t_plain = exp_so3(step[:3]) @ R_plain, t_plain + step[3:]
+        small = np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 5e-4
+        if small:
+            break
+    assert found == (n, small, matched, inside)
+    assert small
+    np.testing.assert_allclose(R, R_plain, atol=1e-9)
+    np.testing.assert_allclose(t, t_plain, atol=1e-8)
+
+
+def test_descent_ends_where_too_little_matches(scene):
+    m, T, points = scene
+    R, t = T[:3, :3].copy(), T[:3, 3] + [0.0, 0.0, 500.0]
+    found = descend(
+        points, WHEELS_M, R, t, m.index, m.A, m.b, m.mean_m, m.information, 2.0, 10.0, 2.5, 40.0, 250.0, 1e-4, 5e-4,
+        15, 60,
+    )  # fmt: skip
+    assert found == (1, False, 0, 0)
 
 
 def test_gradient_is_the_slope_of_the_cost(scene):

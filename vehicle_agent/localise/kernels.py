@@ -6,6 +6,8 @@ from gnd.gnd_map.arrays import F64, I32
 from gnd.gnd_map.jit import kernel
 
 JACOBI_SWEEPS = 6  # a symmetric 3x3 matrix is diagonal to 1e-15 after five
+MOST_SWEEPS = 30  # of larger ones, which stop when they are diagonal: after six or seven
+LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
 
 @kernel
@@ -245,3 +247,192 @@ def pulls(
             u2 = w[0] * a1 - w[1] * a0 + w[5]
             pull[row, k] += s * s * (u0 * f0 + u1 * f1 + u2 * f2)
             weight[row, k] += s * s * _mahalanobis2(o, u0, u1, u2)
+
+
+@kernel
+def cholesky(S: F64, least: float, L: F64) -> bool:
+    """Fill L (6, 6) with the lower factor of S - `least` I, S symmetric; False where that is not positive definite, so
+    that not all eigenvalues of S are above `least`.
+    """
+    for r in range(6):
+        for c in range(r + 1):
+            rest = S[r, c] - (least if r == c else 0.0)
+            for k in range(c):
+                rest -= L[r, k] * L[c, k]
+            if r > c:
+                L[r, c] = rest / L[c, c]
+            elif rest > 0.0:
+                L[r, r] = np.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@kernel
+def _rotate(S: F64, V: F64, p: int, q: int) -> None:
+    """Turn the symmetric S (n, n) so that S[p, q] becomes 0, and the columns of V with it."""
+    if S[p, q] == 0.0:
+        return
+    theta = 0.5 * (S[q, q] - S[p, p]) / S[p, q]
+    t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
+    c = 1.0 / np.sqrt(t * t + 1.0)
+    s = t * c
+    for r in range(S.shape[0]):
+        S[r, p], S[r, q] = c * S[r, p] - s * S[r, q], s * S[r, p] + c * S[r, q]
+        V[r, p], V[r, q] = c * V[r, p] - s * V[r, q], s * V[r, p] + c * V[r, q]
+    for r in range(S.shape[0]):
+        S[p, r], S[q, r] = c * S[p, r] - s * S[q, r], s * S[p, r] + c * S[q, r]
+
+
+@kernel
+def principal(S: F64, V: F64) -> None:
+    """Make the symmetric S (n, n) diagonal; the columns of V (n, n) become its eigenvectors (cyclic Jacobi)."""
+    V[:] = 0.0
+    for r in range(S.shape[0]):
+        V[r, r] = 1.0
+    for _ in range(MOST_SWEEPS):
+        beside, on = 0.0, 0.0
+        for r in range(S.shape[0]):
+            on += S[r, r] * S[r, r]
+            for c in range(r):
+                beside += S[r, c] * S[r, c]
+        if beside <= 1e-30 * on:
+            return
+        for p in range(S.shape[0] - 1):
+            for q in range(p + 1, S.shape[0]):
+                _rotate(S, V, p, q)
+
+
+@kernel
+def newton_step(H: F64, g: F64, least: float, step: F64) -> None:
+    """Fill `step` (6,) with -H^-1 g without the directions of which H, turns measured at `LEVER_M`, has no more than
+    `least` (solution remapping, Zhang et al. 2016). `registration._solve` is the plain twin.
+    """
+    S, L, V = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6))
+    for r in range(6):
+        for c in range(6):
+            S[r, c] = H[r, c] / ((LEVER_M if r < 3 else 1.0) * (LEVER_M if c < 3 else 1.0))
+    if cholesky(S, least, L) and cholesky(S, 0.0, L):  # nearly always: all directions count
+        for r in range(6):
+            step[r] = -g[r] / (LEVER_M if r < 3 else 1.0)
+            for c in range(r):
+                step[r] -= L[r, c] * step[c]
+            step[r] /= L[r, r]
+        for r in range(5, -1, -1):
+            for c in range(r + 1, 6):
+                step[r] -= L[c, r] * step[c]
+            step[r] /= L[r, r]
+    else:
+        principal(S, V)
+        step[:] = 0.0
+        for k in range(6):
+            if S[k, k] > least:
+                pull = 0.0
+                for r in range(6):
+                    pull += V[r, k] * g[r] / (LEVER_M if r < 3 else 1.0)
+                for r in range(6):
+                    step[r] -= V[r, k] * pull / S[k, k]
+    for r in range(3):
+        step[r] /= LEVER_M
+
+
+@kernel
+def _turned(step: F64, R: F64) -> None:
+    """R (3, 3) becomes exp(step[:3]) R."""
+    x, y, z = step[0], step[1], step[2]
+    angle = np.sqrt(x * x + y * y + z * z)
+    half_sine = np.sin(0.5 * angle) / angle if angle > 1e-8 else 0.5
+    x, y, z, w = half_sine * x, half_sine * y, half_sine * z, np.cos(0.5 * angle)
+    for c in range(3):
+        a, b, d = R[0, c], R[1, c], R[2, c]
+        R[0, c] = (1.0 - 2.0 * (y * y + z * z)) * a + 2.0 * (x * y - z * w) * b + 2.0 * (x * z + y * w) * d
+        R[1, c] = 2.0 * (x * y + z * w) * a + (1.0 - 2.0 * (x * x + z * z)) * b + 2.0 * (y * z - x * w) * d
+        R[2, c] = 2.0 * (x * z - y * w) * a + 2.0 * (y * z + x * w) * b + (1.0 - 2.0 * (x * x + y * y)) * d
+
+
+@kernel
+def stand(
+    wheels: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale: float, gate: float,
+    weight: float, H: F64, g: F64,
+) -> int:  # fmt: skip
+    """Add points of the vehicle that stand on the map's ground, the wheels (W, 3), to H (6, 6) and g (6,) of
+    `linearise`, each `weight` times; gives how many do.
+
+    They tell turns about the map's east and north, and height: of a road of which the map holds single rings, its
+    Gaussians would give where the rings lie. scale: of Geman-McClure [sigmas]. gate: largest distance in scales.
+    """
+    if weight <= 0.0:
+        return 0
+    more, slope = np.empty((6, 6)), np.empty(6)
+    gate_m2 = (gate * scale) ** 2
+    _, on_ground, _ = linearise(wheels, R, t, index, A, b, mean, omega, scale**2, gate_m2, more, slope)
+    for r in (0, 1, 5):
+        g[r] += weight * slope[r]
+        for c in (0, 1, 5):
+            H[r, c] += weight * more[r, c]
+    return on_ground
+
+
+@kernel
+def descend(
+    points: F64, wheels: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale: float,
+    wheel_scale: float, gate: float, wheel_weight: float, least: float, stop_rad: float, stop_m: float, most_steps: int,
+    least_matched: int,
+) -> tuple[int, bool, int, int]:  # fmt: skip
+    """Gauss-Newton steps of the pose R (3, 3), t (3,), which is moved, at one robust scale until they are small.
+
+    What is not named here is as in `linearise` and `stand`. wheel_scale: the wheels' own. least: information that a
+    direction must have, see `newton_step`. stop_rad, stop_m: a step is small below these. least_matched: it ends early
+    where fewer points match.
+
+    Returns:
+        steps; whether the last was small; points matched, and in known voxels, at the last pose that was looked from.
+    """
+    H, g, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    matched, inside = 0, 0
+    gate_m2 = (gate * scale) ** 2
+    for n in range(1, most_steps + 1):
+        _, matched, inside = linearise(points, R, t, index, A, b, mean, omega, scale**2, gate_m2, H, g)
+        if matched < least_matched:
+            return n, False, matched, inside
+        stand(wheels, R, t, index, A, b, mean, omega, wheel_scale, gate, wheel_weight, H, g)
+        newton_step(H, g, least, step)
+        _turned(step, R)
+        turn, shift = 0.0, 0.0
+        for r in range(3):
+            t[r] += step[r + 3]
+            turn, shift = max(turn, abs(step[r])), max(shift, abs(step[r + 3]))
+        if turn < stop_rad and shift < stop_m:
+            return n, True, matched, inside
+    return most_steps, False, matched, inside
+
+
+@kernel
+def without_hints(H: F64, share: float, constrained: F64) -> bool:
+    """Fill `constrained` (6, 6): takes from a motion the horizontal directions for which H (6, 6), turns measured at
+    `LEVER_M`, has less than `share` of the strongest; False where it takes nothing.
+    """
+    S, V = np.empty((6, 6)), np.empty((6, 6))
+    for r in range(6):
+        for c in range(6):
+            S[r, c] = H[r, c] / ((LEVER_M if r < 3 else 1.0) * (LEVER_M if c < 3 else 1.0))
+    principal(S, V)
+    strongest = 0.0
+    for k in range(6):
+        if V[3, k] * V[3, k] + V[4, k] * V[4, k] > 0.5:
+            strongest = max(strongest, S[k, k])
+    constrained[:] = 0.0
+    takes = False
+    for k in range(6):
+        if V[3, k] * V[3, k] + V[4, k] * V[4, k] > 0.5 and S[k, k] <= share * strongest:
+            takes = True
+            continue
+        for r in range(6):
+            for c in range(6):
+                levers = (LEVER_M if c < 3 else 1.0) / (LEVER_M if r < 3 else 1.0)
+                constrained[r, c] += V[r, k] * V[c, k] * levers
+    if not takes:
+        constrained[:] = 0.0
+        for r in range(6):
+            constrained[r, r] = 1.0
+    return takes

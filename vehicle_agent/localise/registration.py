@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.kernels import linearise
+from gnd.vehicle_agent.localise.kernels import LEVER_M, descend, linearise, stand, without_hints
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 
@@ -29,9 +29,7 @@ Start = Literal["near", "wide", "capture"]
 # Where a car's wheels touch the road, vehicle frame (origin on the road under the middle of the rear axle), metres.
 WHEELS_M = np.array([[0.0, 0.8, 0.0], [0.0, -0.8, 0.0], [2.8, 0.8, 0.0], [2.8, -0.8, 0.0]])
 WHEEL_SCALE = 10.0  # in sigmas of a point: a kerb or a road that was raised, but not a frame that lies elsewhere
-WHEELS_TELL = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])  # turns about the map's east and north, and height
 SETTLING = 3
-LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,29 +171,19 @@ def linearised(
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = state.R
     H, g = turn.T @ state.H @ turn, turn.T @ state.g
-    constrained = _without_hints(H)
+    constrained = np.empty((6, 6))
+    if without_hints(H, _DEGENERATE_SHARE, constrained):
+        H, g = constrained.T @ H @ constrained, constrained.T @ g
     return Linearised(
         T.copy(),
         scale,
-        constrained.T @ H @ constrained,
-        constrained.T @ g,
+        H,
+        g,
         state.cost,
         state.matched,
         state.inside,
         constrained,
     )
-
-
-def _without_hints(H: F64) -> F64:
-    """(6, 6) that takes from a motion the horizontal directions for which H (6, 6) has less than `degenerate_share` of
-    the strongest.
-    """
-    values, vectors, scale = _principal(H)
-    horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
-    strongest = float(values[horizontal].max(initial=0.0))
-    constrained = ~horizontal | (values > _DEGENERATE_SHARE * strongest)
-    along = vectors[:, constrained]
-    return np.eye(6) if constrained.all() else np.asarray((along @ along.T) * scale[:, None] / scale)
 
 
 def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters) -> float:
@@ -247,50 +235,56 @@ def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters,
         points, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, s.H, s.g
     )
     _add_wheels(s, m, par, scale)
+    _check_matched(s, len(points))
+
+
+def _check_matched(s: _State, n_points: int) -> None:
     if s.matched < REGISTRATION_MIN_MATCHED:
         raise RegistrationError(
-            f"{s.matched} of {len(points)} points have a Gaussian nearby ({s.inside} lie in known voxels),"
+            f"{s.matched} of {n_points} points have a Gaussian nearby ({s.inside} lie in known voxels),"
             f" {REGISTRATION_MIN_MATCHED} are needed: is the start within 2 m, is the map loaded?"
         )
 
 
 def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> int:
     """The wheels stand on the map's ground: points of their own weight, as uncertain as springs and tyres are; gives
-    how many do. They constrain height, roll and pitch only: of a road of which the map holds single rings, its
-    Gaussians would give where the rings lie.
+    how many do.
     """
-    if par.rules.wheel_sigma_m <= 0:
-        return 0
-    scale = max(scale, WHEEL_SCALE)
-    H, g = np.empty((6, 6)), np.empty(6)
-    gate_m2 = (REGISTRATION_GATE_PER_SCALE * scale) ** 2
-    _, on_ground, _ = linearise(
-        s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g
-    )
-    weight = par.rules.correlation * (par.noise_m / par.rules.wheel_sigma_m) ** 2
-    s.H += weight * H * WHEELS_TELL * WHEELS_TELL[:, None]
-    s.g += weight * g * WHEELS_TELL
-    return on_ground
+    return stand(
+        s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, max(scale, WHEEL_SCALE),
+        REGISTRATION_GATE_PER_SCALE, _wheel_weight(par), s.H, s.g,
+    )  # fmt: skip
+
+
+def _wheel_weight(par: RegistrationParameters) -> float:
+    """How many points a wheel counts for; 0: wheels are no witness."""
+    sigma_m = par.rules.wheel_sigma_m
+    return par.rules.correlation * (par.noise_m / sigma_m) ** 2 if sigma_m > 0 else 0.0
 
 
 def _descend(
     points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float, coarse: float
 ) -> tuple[int, bool]:
     """Gauss-Newton steps at one robust scale until they are small; (steps, converged)."""
-    for n in range(1, par.rules.max_iterations + 1):
-        _linearise(points, s, m, par, scale)
-        step = _solve(s.H, s.g, par)
-        s.R = exp_so3(step[:3]) @ s.R
-        s.t = s.t + step[3:]
-        if np.abs(step[:3]).max() < coarse * par.rules.stop_rad and np.abs(step[3:]).max() < coarse * par.rules.stop_m:
-            return n, True
-    return par.rules.max_iterations, False
+    rules = par.rules
+    steps, converged, s.matched, s.inside = descend(
+        points, s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale, max(scale, WHEEL_SCALE),
+        REGISTRATION_GATE_PER_SCALE, _wheel_weight(par), _least_information(par), coarse * rules.stop_rad,
+        coarse * rules.stop_m, rules.max_iterations, REGISTRATION_MIN_MATCHED,
+    )  # fmt: skip
+    _check_matched(s, len(points))
+    return steps, converged
+
+
+def _least_information(par: RegistrationParameters) -> float:
+    """That a direction must have to be moved along, 1/m²."""
+    return par.rules.correlation / par.rules.degenerate_m**2
 
 
 def _solve(H: F64, g: F64, par: RegistrationParameters) -> F64:
     """-H^-1 g, leaving out the directions that are degenerate (solution remapping, Zhang et al. 2016)."""
     values, vectors, scale = _principal(H)
-    strong = values > par.rules.correlation / par.rules.degenerate_m**2
+    strong = values > _least_information(par)
     along = vectors[:, strong]
     return np.asarray(-(along @ ((along.T @ (g * scale)) / values[strong])) * scale)
 
@@ -307,7 +301,7 @@ def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[n
     the noise of a map gives along an even wall.
     """
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
-    least = par.rules.correlation / par.rules.degenerate_m**2
+    least = _least_information(par)
     strongest = float(values[horizontal].max(initial=0.0))  # not the vertical, which wheels on the road hold firmly
     return np.asarray(values > np.where(horizontal, max(least, _DEGENERATE_SHARE * strongest), least))
 
@@ -315,7 +309,7 @@ def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[n
 def _unmoved(s: _State, T_start: F64, par: RegistrationParameters) -> bool:
     """Take back what was moved along horizontal directions that the scan does not constrain; True if there were any."""
     values, vectors, _ = _principal(s.H)
-    weak = vectors[3:, ~_strong(values, vectors, par) & (values > par.rules.correlation / par.rules.degenerate_m**2)]
+    weak = vectors[3:, ~_strong(values, vectors, par) & (values > _least_information(par))]
     if not weak.size:
         return False
     weak = weak / np.linalg.norm(weak, axis=0)

@@ -59,7 +59,7 @@ def variance_by_scans(steps: Sequence[Sequence[StretchStep]], shared_off: F64) -
     for i in range(0, len(steps) - WINDOW + 1, WINDOW // 2):
         window = steps[i : i + WINDOW]
         if all(len(measured) > 1 for measured in window):
-            off = np.array([residual(seen.T_before_now, driven, shared_off)[0] for driven, seen, *_ in window])
+            off = np.array([residual(seen.T_before_now, driven, shared_off) for driven, seen, *_ in window])
             variance = np.array([np.diag(driven.covariance) for driven, *_ in window])
             by_scans = np.array([np.diag(seen.covariance) for _, seen, *_ in window])
             windows.append(off.sum(axis=0) ** 2 / variance.sum(axis=0))

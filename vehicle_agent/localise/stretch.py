@@ -14,15 +14,17 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64, I32
 from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise.influence import SeenScan, influence
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
+from gnd.vehicle_agent.localise.stretch_kernels import SHARED, add_matches, add_steps, motions, residuals, solve
 
-N_SHARED: Final = 4
+N_SHARED: Final = SHARED
 """What all steps share: gyro bias [rad/s], wheel scale [1], motion to the left and upwards per metre forward [1]."""
 BIAS, SCALE, LEFT, UP = range(N_SHARED)
 STEP_CHI2: Final = 12.6
@@ -116,6 +118,56 @@ class _System(NamedTuple):
     A: F64
     g: F64
 
+    def solution(self) -> F64:
+        """A^-1 g (n,)."""
+        L, x = np.empty_like(self.A), np.empty_like(self.g)
+        return x if solve(self.A, self.g, L, x) else np.linalg.solve(self.A, self.g).astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Steps:
+    """All M measurements of the motions of a stretch.
+
+    Attributes:
+        first: (M,) int32, the knot that each starts from.
+        T_before_now: (M, 4, 4).
+        information: (M, 6, 6).
+        shared: (M, 6, N_SHARED).
+        variance: (M, 6).
+        leads: (M,) bool, whether it is the first measurement of its motion.
+    """
+
+    first: I32
+    T_before_now: F64
+    information: F64
+    shared: F64
+    variance: F64
+    leads: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, steps: Sequence[Sequence[StretchStep]]) -> "_Steps":
+        """From what is known of the motion between neighbours."""
+        all_of_them = [step for measured in steps for step in measured]
+        covariance = np.array([step.covariance for step in all_of_them], np.float64).reshape(-1, 6, 6)
+        return cls(
+            np.repeat(np.arange(len(steps), dtype=np.int32), [len(measured) for measured in steps]),
+            np.array([step.T_before_now for step in all_of_them], np.float64).reshape(-1, 4, 4),
+            np.linalg.inv(covariance).astype(np.float64),
+            np.array([step.shared for step in all_of_them], np.float64).reshape(-1, 6, N_SHARED),
+            np.einsum("mii->mi", covariance),
+            np.array([n == 0 for measured in steps for n in range(len(measured))], np.bool_),
+        )
+
+    def residuals(self, T_map_vehicle: F64, shared_off: F64) -> tuple[F64, F64, F64]:
+        """Residuals (M, 6) at poses (N, 4, 4), their derivatives (M, 6, 12 + N_SHARED), and robust weights (M,)."""
+        m = len(self.first)
+        e, J, weight = np.empty((m, 6)), np.empty((m, 6, 12 + N_SHARED)), np.empty(m)
+        residuals(
+            T_map_vehicle, self.first, self.T_before_now, self.information, self.shared, shared_off, STEP_CHI2, e, J,
+            weight,
+        )  # fmt: skip
+        return e, J, weight
+
 
 def solve_stretch(
     knots: Sequence[Knot],
@@ -137,20 +189,19 @@ def solve_stretch(
         scales: robust scales in sigmas, wide to narrow.
         max_iterations: Gauss-Newton steps at each scale.
     """
-    shared = belief.shared.copy()
+    shared, measured = belief.shared.copy(), _Steps.of(steps)
     for scale in scales:
         for _ in range(max_iterations):
             _match(knots, match_map, registration, scale)
-            system = _system(knots, steps, belief, shared, registration)
-            step: F64 = -np.linalg.solve(system.A, system.g).astype(np.float64)
+            step = -_system(knots, measured, belief, shared, registration).solution()
             _move(knots, step)
             shared += step[-N_SHARED:]
             if _small(step[:-N_SHARED].reshape(-1, 6), STOP_M, STOP_RAD):
                 break
     _match(knots, match_map, registration, scales[-1])
-    covariance = np.asarray(np.linalg.inv(_system(knots, steps, belief, shared, registration).A), np.float64)
+    covariance = np.asarray(np.linalg.inv(_system(knots, measured, belief, shared, registration).A), np.float64)
     seen = _as_seen(knots, belief, covariance, match_map, registration)
-    return _solved(knots, steps, covariance, shared - belief.shared, belief.shared, registration, scales[-1], *seen)
+    return _solved(knots, measured, covariance, shared - belief.shared, belief.shared, registration, scales[-1], *seen)
 
 
 def marginalised(
@@ -165,7 +216,7 @@ def marginalised(
     The match of the last knot is not part of it: it stays with the stretch that goes on there.
     """
     last = Knot(knots[-1].points_m, knots[-1].T_map_vehicle, knots[-1].weight)
-    A, g = _system([*knots[:-1], last], steps, belief, shared, registration)
+    A, g = _system([*knots[:-1], last], _Steps.of(steps), belief, shared, registration)
     kept = slice(6 * (len(knots) - 1), None)
     gone = slice(0, 6 * (len(knots) - 1))
     through = np.linalg.solve(A[gone, gone], np.column_stack([A[gone, kept], g[gone]]))
@@ -176,38 +227,50 @@ def marginalised(
 
 def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParameters, scale: float) -> None:
     """Match the knots with the map that have moved since, or were matched with another scale."""
+    matched = [knot for knot in knots if knot.match is not None]
+    moved = dict(zip(map(id, matched), _moved(matched), strict=True))
     for knot in knots:
-        m, T = knot.match, knot.T_map_vehicle
-        if (
-            m is not None
-            and m.scale == scale
-            and _small(log_se3(T_inverse(m.T_map_vehicle) @ T)[None], SMALL_M, SMALL_RAD)
-        ):
+        if knot.match is not None and knot.match.scale == scale and _small(moved[id(knot)][None], SMALL_M, SMALL_RAD):
             continue
-        knot.match = linearised(knot.points_m, T, match_map, par, scale, knot.wheels_m)
+        knot.match = linearised(knot.points_m, knot.T_map_vehicle, match_map, par, scale, knot.wheels_m)
+
+
+def _moved(matched: Sequence[Knot]) -> F64:
+    """(M, 6) how far M matched knots have moved since they were matched."""
+    off = np.empty((len(matched), 6))
+    then = [knot.match.T_map_vehicle for knot in matched if knot.match is not None]
+    motions(np.array(then).reshape(-1, 4, 4), _poses(matched), off)
+    return off
+
+
+def _poses(knots: Sequence[Knot]) -> F64:
+    return np.array([knot.T_map_vehicle for knot in knots], np.float64).reshape(-1, 4, 4)
 
 
 def _system(
-    knots: Sequence[Knot],
-    steps: Sequence[Sequence[StretchStep]],
-    belief: StretchBelief,
-    shared: F64,
-    par: RegistrationParameters,
+    knots: Sequence[Knot], steps: _Steps, belief: StretchBelief, shared: F64, par: RegistrationParameters
 ) -> _System:
     n = 6 * len(knots) + N_SHARED
     A, g = np.zeros((n, n)), np.zeros(n)
     _add_belief(A, g, knots[0], belief, shared)
-    for k, knot in enumerate(knots):
-        if knot.match is not None:
-            at, weight = slice(6 * k, 6 * k + 6), knot.weight / par.rules.correlation
-            moved = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
-            A[at, at] += weight * knot.match.H
-            g[at] += weight * (knot.match.g + knot.match.H @ moved)
-    for k, measured in enumerate(steps):
-        relative = T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle
-        for step in measured:
-            _add_step(A, g, k, relative, step, shared - belief.shared)
+    at, matched = _matched(knots)
+    weight = np.array([knot.weight for knot in matched]) / par.rules.correlation
+    add_matches(at, _moved(matched), weight, *_second_order(matched), A, g)
+    add_steps(steps.first, steps.information, *steps.residuals(_poses(knots), shared - belief.shared), A, g)
     return _System(A, g)
+
+
+def _matched(knots: Sequence[Knot]) -> tuple[I32, list[Knot]]:
+    """The knots that have a match, and where they stand, (M,) int32."""
+    found = [(k, knot) for k, knot in enumerate(knots) if knot.match is not None]
+    return np.array([k for k, _ in found], np.int32), [knot for _, knot in found]
+
+
+def _second_order(matched: Sequence[Knot]) -> tuple[F64, F64]:
+    """H (M, 6, 6) and g (M, 6) of M matches."""
+    matches = [knot.match for knot in matched if knot.match is not None]
+    H, g = (np.array([getattr(match, name) for match in matches], np.float64) for name in ("H", "g"))
+    return H.reshape(-1, 6, 6), g.reshape(-1, 6)
 
 
 def _add_belief(A: F64, g: F64, first: Knot, belief: StretchBelief, shared: F64) -> None:
@@ -217,34 +280,9 @@ def _add_belief(A: F64, g: F64, first: Knot, belief: StretchBelief, shared: F64)
     g[at] += belief.gradient + belief.information @ off
 
 
-def _add_step(A: F64, g: F64, k: int, relative: F64, step: StretchStep, shared_off: F64) -> None:
-    """A measured motion from knot k to k + 1, with its robust weight."""
-    e, J = residual(relative, step, shared_off)
-    information, weight = _weighed(e, step)
-    weighted = weight * J.T @ information
-    at = np.r_[6 * k : 6 * k + 12, len(g) - N_SHARED : len(g)]
-    A[np.ix_(at, at)] += weighted @ J
-    g[at] += weighted @ e
-
-
-def _weighed(e: F64, step: StretchStep) -> tuple[F64, float]:
-    """Information (6, 6) of a step, and its Geman-McClure weight at a residual (6,)."""
-    information: F64 = np.linalg.inv(step.covariance).astype(np.float64)
-    return information, 1.0 / (1.0 + float(e @ information @ e) / STEP_CHI2) ** 2
-
-
-def residual(relative: F64, step: StretchStep, shared_off: F64) -> tuple[F64, F64]:
-    """Residual e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,) of a step, and its derivative (6, 12 + N_SHARED) after
-    both poses and the shared parameters.
-    """
-    e = log_se3(T_inverse(step.T_before_now) @ relative) - step.shared @ shared_off
-    J = np.zeros((6, 12 + N_SHARED))
-    p, R, R_Z = relative[:3, 3], relative[:3, :3], step.T_before_now[:3, :3]
-    J[:3, :3], J[:3, 6:9] = -R.T, np.eye(3)
-    J[3:, :3] = R_Z.T @ np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
-    J[3:, 3:6], J[3:, 9:12] = -R_Z.T, R_Z.T @ R
-    J[:, 12:] = -step.shared
-    return e, J
+def residual(relative: F64, step: StretchStep, shared_off: F64) -> F64:
+    """Residual e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,) of a step."""
+    return log_se3(T_inverse(step.T_before_now) @ relative) - step.shared @ shared_off
 
 
 def _move(knots: Sequence[Knot], step: F64) -> None:
@@ -256,7 +294,7 @@ def _move(knots: Sequence[Knot], step: F64) -> None:
 
 def _solved(
     knots: Sequence[Knot],
-    steps: Sequence[Sequence[StretchStep]],
+    steps: _Steps,
     covariance: F64,
     shared_off: F64,
     shared_before: F64,
@@ -311,42 +349,31 @@ def _as_seen(
     return seen, np.asarray(share)
 
 
-def _is_torn(knots: Sequence[Knot], steps: Sequence[Sequence[StretchStep]], shared_off: F64) -> bool:
-    for k, measured in enumerate(steps):
-        relative = T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle
-        if max(_weighed(residual(relative, step, shared_off)[0], step)[1] for step in measured) < TORN_WEIGHT:
-            return True
-    return False
+def _is_torn(knots: Sequence[Knot], steps: _Steps, shared_off: F64) -> bool:
+    best = np.zeros(len(knots) - 1)
+    np.maximum.at(best, steps.first, steps.residuals(_poses(knots), shared_off)[2])
+    return bool((best < TORN_WEIGHT).any())
 
 
-def _checked_steps(
-    knots: Sequence[Knot], steps: Sequence[Sequence[StretchStep]], covariance: F64, shared_off: F64
-) -> tuple[F64, F64]:
-    squares, redundancy, n = np.zeros(6), np.zeros(6), len(covariance)
-    for k, (step, *_) in enumerate(steps):
-        e, J = residual(T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle, step, shared_off)
-        at = np.r_[6 * k : 6 * k + 12, n - N_SHARED : n]
-        variance = np.diag(step.covariance)
-        left_open = _weighed(e, step)[1] * np.diag(J @ covariance[np.ix_(at, at)] @ J.T) / variance
-        squares += np.minimum(e**2 / variance, MOST_SQUARE)
-        redundancy += np.clip(1.0 - left_open, 0.0, 1.0)
-    return squares, redundancy
+def _checked_steps(knots: Sequence[Knot], steps: _Steps, covariance: F64, shared_off: F64) -> tuple[F64, F64]:
+    e, J, weight = (of[steps.leads] for of in steps.residuals(_poses(knots), shared_off))
+    variance, n = steps.variance[steps.leads], len(covariance)
+    at = np.concatenate([np.arange(12), np.arange(n - N_SHARED, n)]) + np.zeros((len(e), 1), np.int64)
+    at[:, :12] += 6 * steps.first[steps.leads][:, None]
+    by_others = np.einsum("mri,mij,mrj->mr", J, covariance[at[:, :, None], at[:, None, :]], J, optimize=True)
+    redundancy = np.clip(1.0 - weight[:, None] * by_others / variance, 0.0, 1.0)
+    return np.minimum(e**2 / variance, MOST_SQUARE).sum(axis=0), redundancy.sum(axis=0)
 
 
 def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
     """Mean over the knots' constrained directions of their squared disagreement with the solution, in sigmas."""
     scale = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
-    total, n = 0.0, 0
-    for knot in knots:
-        if knot.match is None:
-            continue
-        off = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
-        values, vectors = np.linalg.eigh(knot.match.H * scale * scale[:, None])
-        strong = values > par.rules.correlation / par.rules.degenerate_m**2
-        pull = vectors[:, strong].T @ ((knot.match.g + knot.match.H @ off) * scale)
-        total += float((pull**2 / values[strong]).sum()) / par.rules.correlation
-        n += int(strong.sum())
-    return total / max(n, 1)
+    _, matched = _matched(knots)
+    H, g = _second_order(matched)
+    values, vectors = np.linalg.eigh(H * scale * scale[:, None])
+    strong = values > par.rules.correlation / par.rules.degenerate_m**2
+    pull = np.einsum("mij,mi->mj", vectors, (g + np.einsum("mij,mj->mi", H, _moved(matched))) * scale)
+    return float((pull[strong] ** 2 / values[strong]).sum()) / par.rules.correlation / max(int(strong.sum()), 1)
 
 
 def shared_of(T_driven: F64, dt_s: float) -> F64:
