@@ -3,6 +3,7 @@
 import importlib
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -25,11 +26,25 @@ def checkout() -> Path:
     return root
 
 
-def _command(module: str, name: str) -> click.Command:
+def _study(module: str, name: str) -> Any:
     root = str(checkout())
     if root not in sys.path:
         sys.path.insert(0, root)
-    command: click.Command = getattr(importlib.import_module(module), name)
+    return getattr(importlib.import_module(module), name)
+
+
+def beside_peers(rounds: int) -> dict[str, float]:
+    """CPU time of peers in units of ours, by name.
+
+    Raises:
+        NoStudies: as of `checkout`.
+    """
+    found: dict[str, float] = _study("studies.speed.ratios", "ratios")(rounds)
+    return found
+
+
+def _command(module: str, name: str) -> click.Command:
+    command: click.Command = _study(module, name)
     return command
 
 

@@ -1,0 +1,1 @@
+"""`gnd bench agent`: what a vehicle costs, by stage, alone on this machine."""
