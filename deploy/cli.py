@@ -3,7 +3,10 @@
 from gnd.ending import catch_signals, ending_at_once, exit_code, run_program, working  # isort: skip  # before others
 
 if __name__ == "__main__":  # `python -m gnd.deploy.cli`: before the heavy imports
+    from gnd.program import one_thread_for_matrices
+
     catch_signals()
+    one_thread_for_matrices()
 
 import importlib
 import os
@@ -54,7 +57,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "localise": ("gnd.vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
     "play": ("gnd.deploy.play:play_command", "Publish a recording as sensors would: ROS 2 topics, or plain keys."),
     "doctor": ("gnd.deploy.doctor.command:doctor", "What keeps programs from working here, and what to do about it."),
-    "bench": ("gnd.deploy.bench.command:bench", "What a vehicle costs on this machine: CPU, memory and start, by stage."),
+    "bench": (
+        "gnd.deploy.bench.command:bench",
+        "What a vehicle costs on this machine: CPU, memory and start, by stage.",
+    ),
     "config": ("gnd.deploy.config_cli:config", "Show and check the settings of the programs."),
     "sim": ("gnd.fleet_sim.cli:sim", "Write and inspect simulated worlds and drives."),
     "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and compare them with ours."),

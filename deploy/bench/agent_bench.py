@@ -197,7 +197,7 @@ class _Vehicles:
         asked = {"settings": plain_settings(replace(agent, work_dir=work)), "out": str(work / "measured.json")}
         (work / "asked.json").write_text(json.dumps(asked), encoding="utf-8")
         kernels = {"NUMBA_CACHE_DIR": str(work / "kernels")} if compile_all else {}
-        _run_process(work, {**os.environ, **kernels}, self.folder.logs / f"{name}.log")
+        _run_process(work, {**os.environ, "OPENBLAS_NUM_THREADS": "1", **kernels}, self.folder.logs / f"{name}.log")
         self.progress.remove_task(task)
         told = json.loads((work / "measured.json").read_text(encoding="utf-8"))
         if compile_all:
@@ -225,7 +225,9 @@ def flame_graph(work: Path, out: Path, log: Path) -> None:
     Raises:
         DeployError: py-spy is not installed, or may not look at its own child here.
     """
-    py_spy = shutil.which("py-spy", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+    py_spy = shutil.which(
+        "py-spy", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    )
     if py_spy is None:
         raise DeployError("there is no py-spy: pip install py-spy")
     command = [py_spy, "record", "--format", "speedscope", "--output", str(out), "--rate", "250", "--"]
@@ -234,4 +236,3 @@ def flame_graph(work: Path, out: Path, log: Path) -> None:
         code = subprocess.run(command, stdout=stream, stderr=subprocess.STDOUT, check=False).returncode  # noqa: S603
     if code or not out.exists():
         raise DeployError(f"py-spy ended with code {code}: read {log}")
-

@@ -26,8 +26,12 @@ def bench() -> None:
 @click.argument("drive", type=click.Path(exists=True, path_type=Path, dir_okay=False), required=False)
 @click.option("--map", "base_map", type=_PATH, help="Store with the map of DRIVE (`gnd map build`).")
 @click.option("--world-seed", type=int, default=7, show_default=True, help="Seed of the simulated street.")
-@click.option("--first/--no-first", default=True, show_default=True, help="Measure the first start ever, too (minutes).")
-@click.option("--rounds", type=click.IntRange(min=0), default=5, show_default=True, help="Rounds beside peers; 0: none.")
+@click.option(
+    "--first/--no-first", default=True, show_default=True, help="Measure the first start ever, too (minutes)."
+)
+@click.option(
+    "--rounds", type=click.IntRange(min=0), default=5, show_default=True, help="Rounds beside peers; 0: none."
+)
 @click.option("--flame", type=_PATH, help="Write a flame graph of the last drive here (speedscope; needs py-spy).")
 @click.option("--out", type=_PATH, default=_DEFAULT, show_default=True, help="Folder of the run, replaced if need be.")
 @click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")

@@ -19,16 +19,6 @@ if TYPE_CHECKING:
     from gnd.vehicle_agent.vehicle import AgentVehicle
 
 READING = "reading the recording"
-PAGE_BYTES = 4096
-
-
-def resident_mb() -> float:
-    """Memory of this process now, MB, by /proc/self/statm; 0 where there is none."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        return 0.0
-    return pages * PAGE_BYTES / 1e6
 
 
 def parts() -> "tuple[Watched, ...]":
@@ -105,6 +95,7 @@ def _driven(
     vehicle: "AgentVehicle", stopwatch: "Stopwatch", start: dict[str, float], compiled: list[float]
 ) -> dict[str, Any]:
     from gnd.schemas.drive import Scan
+    from gnd.vehicle_agent.memory import resident_mb
 
     at_start_mb, peak_mb, first_ns, last_ns, at_once_s = resident_mb(), 0.0, 0, 0, 0.0
     begun_s = time.process_time()

@@ -99,7 +99,12 @@ def normal_equations(rng, stretch):
     A, g = np.zeros((n, n)), np.zeros(n)
     at = np.array([0, 2, 5], np.int32)
     half = rng.normal(size=(3, 6, 6))
-    H, slope, moved, weight = half @ np.swapaxes(half, 1, 2), rng.normal(size=(3, 6)), rng.normal(size=(3, 6)), [1, 2, 3]
+    H, slope, moved, weight = (
+        half @ np.swapaxes(half, 1, 2),
+        rng.normal(size=(3, 6)),
+        rng.normal(size=(3, 6)),
+        [1, 2, 3],
+    )
     add_matches(at, moved, np.array(weight, float), H, slope, A, g)
     add_steps(first, packed(steps)[1], *of_kernel(T, first, steps, off), A, g)
     return A, g, (at, moved, weight, H, slope)

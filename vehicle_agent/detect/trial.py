@@ -20,10 +20,11 @@ from gnd.vehicle_agent.detect.recent_map import recent_map
 from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, find_shift, gain
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from gnd.vehicle_agent.localise.level import sees_tilt
+from gnd.vehicle_agent.localise.level import looked_at, spreads
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import SamplingParameters
 from gnd.vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.packed_rays import PackedRays
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 
 Verdict = Literal["good", "shifted", "unchecked"]
@@ -40,30 +41,26 @@ _EVERY_RECENT: Final = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _TrialScan:
-    """A scan that waits, in a third of its memory: points to 10 µm, origins to 0.1 mm."""
+    """A scan that waits."""
 
     t_ns: int
     estimate: PoseEstimate
-    centre_m: F64
-    points: F32
-    origins: NDArray[np.int16]
-    origin_step_m: float
+    rays: PackedRays
     moving: NDArray[np.bool_]
 
     @classmethod
     def of(cls, segmented: SegmentedScan) -> "_TrialScan":
         scan = segmented.scan
-        centre = scan.origins_map_m.mean(axis=0) if len(scan.origins_map_m) else np.zeros(3)
-        origins = (scan.origins_map_m - centre).astype(np.float32)
-        step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
-        packed = np.rint(origins / step_m).astype(np.int16)
-        points = (scan.points_map_m - centre).astype(np.float32)
-        return cls(scan.t_ns, scan.estimate, centre, points, packed, step_m, segmented.moving)
+        rays, _ = PackedRays.of(scan.points_map_m, scan.origins_map_m)
+        return cls(scan.t_ns, scan.estimate, rays, segmented.moving)
 
     def restore(self) -> SegmentedScan:
         """The scan as it came."""
-        origins = self.origins * self.origin_step_m + self.centre_m
-        return SegmentedScan(RefinedScan(self.t_ns, self.points + self.centre_m, origins, self.estimate), self.moving)
+        return SegmentedScan(RefinedScan(self.t_ns, *self.rays.restore(), self.estimate), self.moving)
+
+    def still(self) -> F32:
+        """(K, 3) the points that stand, from the centre of its rays."""
+        return self.rays.points_m[~self.moving]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,10 +96,8 @@ class _Recent:
 
     @classmethod
     def of(cls, scans: list[_TrialScan], X: F64) -> "_Recent":
-        centre = scans[0].centre_m
-        still = [
-            held.points[~held.moving][::_EVERY_RECENT] + (held.centre_m - centre).astype(np.float32) for held in scans
-        ]
+        centre = scans[0].rays.centre_m
+        still = [held.still()[::_EVERY_RECENT] + (held.rays.centre_m - centre).astype(np.float32) for held in scans]
         return cls(centre, np.concatenate(still), X)
 
 
@@ -186,11 +181,11 @@ class Trial:
     def _try(self, scans: list[_TrialScan]) -> Tried:
         """Test against the base map, and where that finds a shift against what was seen just before."""
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
-        points = np.concatenate([some_of(held.points[~held.moving], held.centre_m, n) for held in scans])
+        points = np.concatenate([some_of(held.still(), held.rays.centre_m, n) for held in scans])
         T = scans[len(scans) // 2].estimate.T_map_vehicle
         points_m = transform(T_inverse(T), points)
-        seen = scans[0].points @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
-        shift = find_shift(points_m, T, self._map.near(T[:3, 3]), planar=not sees_tilt(seen))
+        seen = looked_at(scans[0].rays.points_m) @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
+        shift = find_shift(points_m, T, self._map.near(T[:3, 3]), planar=not spreads(seen))
         poses = [PoseUncertainty.of(held.estimate) for held in scans]
         worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
         far = shift.is_far(OF_SCANS, worst)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I32
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import inlined, kernel
 
 JACOBI_SWEEPS = 6  # a symmetric 3x3 matrix is diagonal to 1e-15 after five
 MOST_SWEEPS = 30  # of larger ones, which stop when they are diagonal: after six or seven
@@ -57,29 +57,21 @@ def tapered_information(cov: F64, noise_m2: float, uniform_m2: float, informatio
             information[m, 5] += i * z * z
 
 
-@kernel
+@inlined
 def _mahalanobis2(o: F64, d0: float, d1: float, d2: float) -> float:
     """Squared distance d' Omega d with Omega as upper triangle (6,)."""
     mixed = o[1] * d0 * d1 + o[2] * d0 * d2 + o[4] * d1 * d2
     return float(o[0] * d0 * d0 + o[3] * d1 * d1 + o[5] * d2 * d2 + 2.0 * mixed)
 
 
-@kernel
+@inlined
 def _nearest(
-    q0: float, q1: float, q2: float, ix: int, iy: int, iz: int, index: I32, mean: F64, omega: F64, gate_m2: float
+    q0: float, q1: float, q2: float, cell: int, ny: int, nz: int, flat: I32, mean: F64, omega: F64, gate_m2: float
 ) -> tuple[int, float]:
     """Row and squared Mahalanobis distance of the nearest Gaussian of the voxel and its six face neighbours, or -1."""
     best, best_m2 = -1, gate_m2
-    for k in range(7):
-        jx, jy, jz = ix, iy, iz
-        step = 1 if k & 1 else -1
-        if 1 <= k <= 2:
-            jx += step
-        elif 3 <= k <= 4:
-            jy += step
-        elif k >= 5:
-            jz += step
-        row = index[jx, jy, jz]
+    for step in (0, ny * nz, -ny * nz, nz, -nz, 1, -1):
+        row = flat[cell + step]
         if row >= 0:
             m2 = _mahalanobis2(omega[row], q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2])
             if m2 < best_m2:
@@ -87,56 +79,18 @@ def _nearest(
     return best, best_m2
 
 
-@kernel
-def _accumulate(
-    H: F64, g: F64, a0: float, a1: float, a2: float, d0: float, d1: float, d2: float, o: F64, w: float
-) -> None:
-    """Add a point's share: J = [-[a]x, I], H += w J' Omega J (upper triangle), g += w J' Omega d."""
-    o00, o01, o02, o11, o12, o22 = w * o[0], w * o[1], w * o[2], w * o[3], w * o[4], w * o[5]
-    f0, f1, f2 = o00 * d0 + o01 * d1 + o02 * d2, o01 * d0 + o11 * d1 + o12 * d2, o02 * d0 + o12 * d1 + o22 * d2
-    g[0] += a1 * f2 - a2 * f1
-    g[1] += a2 * f0 - a0 * f2
-    g[2] += a0 * f1 - a1 * f0
-    g[3] += f0
-    g[4] += f1
-    g[5] += f2
-    b00, b01, b02 = a1 * o02 - a2 * o01, a1 * o12 - a2 * o11, a1 * o22 - a2 * o12  # B = [a]x Omega
-    b10, b11, b12 = a2 * o00 - a0 * o02, a2 * o01 - a0 * o12, a2 * o02 - a0 * o22
-    b20, b21, b22 = a0 * o01 - a1 * o00, a0 * o11 - a1 * o01, a0 * o12 - a1 * o02
-    H[0, 0] += a1 * b02 - a2 * b01  # B [a]x'
-    H[0, 1] += a2 * b00 - a0 * b02
-    H[0, 2] += a0 * b01 - a1 * b00
-    H[1, 1] += a2 * b10 - a0 * b12
-    H[1, 2] += a0 * b11 - a1 * b10
-    H[2, 2] += a0 * b21 - a1 * b20
-    H[0, 3] += b00
-    H[0, 4] += b01
-    H[0, 5] += b02
-    H[1, 3] += b10
-    H[1, 4] += b11
-    H[1, 5] += b12
-    H[2, 3] += b20
-    H[2, 4] += b21
-    H[2, 5] += b22
-    H[3, 3] += o00
-    H[3, 4] += o01
-    H[3, 5] += o02
-    H[4, 4] += o11
-    H[4, 5] += o12
-    H[5, 5] += o22
-
-
-@kernel
-def _known_cell(q0: float, q1: float, q2: float, index: I32, A: F64, b: F64) -> tuple[int, int, int]:
-    """The cell of the window that a map point lies in; (-1, -1, -1) at its edge, outside, and in tiles not held."""
-    nx, ny, nz = index.shape
+@inlined
+def _known_cell(q0: float, q1: float, q2: float, nx: int, ny: int, nz: int, flat: I32, A: F64, b: F64) -> int:
+    """Number of the cell of the window (nx, ny, nz), `flat`, that a map point lies in; -1 at its edge, outside, and in
+    tiles not held.
+    """
     gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
     gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
     gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
     if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
-        return -1, -1, -1
-    ix, iy, iz = int(gx), int(gy), int(gz)
-    return (-1, -1, -1) if index[ix, iy, iz] < -1 else (ix, iy, iz)
+        return -1
+    cell = (int(gx) * ny + int(gy)) * nz + int(gz)
+    return -1 if flat[cell] < -1 else cell
 
 
 @kernel
@@ -163,27 +117,70 @@ def linearise(
     Returns:
         robust cost (between 0 and scale2 a point), points matched, points in known voxels.
     """
-    H[:] = 0.0
-    g[:] = 0.0
+    nx, ny, nz = index.shape
+    flat, t0, t1, t2 = index.reshape(-1), t[0], t[1], t[2]
     cost, matched, inside = 0.0, 0, 0
+    # Sums in plain numbers, which the processor keeps; in an array each would be stored and loaded for each point.
+    g0 = g1 = g2 = g3 = g4 = g5 = 0.0
+    h00 = h01 = h02 = h11 = h12 = h22 = 0.0
+    h03 = h04 = h05 = h13 = h14 = h15 = h23 = h24 = h25 = 0.0
+    h33 = h34 = h35 = h44 = h45 = h55 = 0.0
     for n in range(points.shape[0]):
         p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
         a0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2
         a1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2
         a2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2
-        q0, q1, q2 = a0 + t[0], a1 + t[1], a2 + t[2]
-        ix, iy, iz = _known_cell(q0, q1, q2, index, A, b)
-        if ix < 0:
+        q0, q1, q2 = a0 + t0, a1 + t1, a2 + t2
+        cell = _known_cell(q0, q1, q2, nx, ny, nz, flat, A, b)
+        if cell < 0:
             continue
         inside += 1
-        row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
+        row, m2 = _nearest(q0, q1, q2, cell, ny, nz, flat, mean, omega, gate_m2)
         if row < 0:
             cost += scale2
             continue
         matched += 1
         cost += scale2 * m2 / (scale2 + m2)  # Geman-McClure
-        s = scale2 / (scale2 + m2)
-        _accumulate(H, g, a0, a1, a2, q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2], omega[row], s * s)
+        w, o = (scale2 / (scale2 + m2)) * (scale2 / (scale2 + m2)), omega[row]
+        d0, d1, d2 = q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2]
+        # J = [-[a]x, I], H += w J' Omega J (upper triangle), g += w J' Omega d
+        o00, o01, o02, o11, o12, o22 = w * o[0], w * o[1], w * o[2], w * o[3], w * o[4], w * o[5]
+        f0, f1, f2 = o00 * d0 + o01 * d1 + o02 * d2, o01 * d0 + o11 * d1 + o12 * d2, o02 * d0 + o12 * d1 + o22 * d2
+        g0 += a1 * f2 - a2 * f1
+        g1 += a2 * f0 - a0 * f2
+        g2 += a0 * f1 - a1 * f0
+        g3 += f0
+        g4 += f1
+        g5 += f2
+        b00, b01, b02 = a1 * o02 - a2 * o01, a1 * o12 - a2 * o11, a1 * o22 - a2 * o12  # B = [a]x Omega
+        b10, b11, b12 = a2 * o00 - a0 * o02, a2 * o01 - a0 * o12, a2 * o02 - a0 * o22
+        b20, b21, b22 = a0 * o01 - a1 * o00, a0 * o11 - a1 * o01, a0 * o12 - a1 * o02
+        h00 += a1 * b02 - a2 * b01  # B [a]x'
+        h01 += a2 * b00 - a0 * b02
+        h02 += a0 * b01 - a1 * b00
+        h11 += a2 * b10 - a0 * b12
+        h12 += a0 * b11 - a1 * b10
+        h22 += a0 * b21 - a1 * b20
+        h03 += b00
+        h04 += b01
+        h05 += b02
+        h13 += b10
+        h14 += b11
+        h15 += b12
+        h23 += b20
+        h24 += b21
+        h25 += b22
+        h33 += o00
+        h34 += o01
+        h35 += o02
+        h44 += o11
+        h45 += o12
+        h55 += o22
+    g[0], g[1], g[2], g[3], g[4], g[5] = g0, g1, g2, g3, g4, g5
+    H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4], H[0, 5] = h00, h01, h02, h03, h04, h05
+    H[1, 1], H[1, 2], H[1, 3], H[1, 4], H[1, 5], H[2, 2] = h11, h12, h13, h14, h15, h22
+    H[2, 3], H[2, 4], H[2, 5], H[3, 3], H[3, 4], H[3, 5] = h23, h24, h25, h33, h34, h35
+    H[4, 4], H[4, 5], H[5, 5] = h44, h45, h55
     for r in range(6):
         for c in range(r):
             H[r, c] = H[c, r]
@@ -196,16 +193,18 @@ def point_fits(
     fits: F64,
 ) -> None:  # fmt: skip
     """Fill `fits` (N,): 1 - robust cost of each point at the pose (R, t), 0 ... 1; arguments as of `linearise`."""
+    nx, ny, nz = index.shape
+    flat = index.reshape(-1)
     for n in range(points.shape[0]):
         fits[n] = 0.0
         p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
         q0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2 + t[0]
         q1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2 + t[1]
         q2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2 + t[2]
-        ix, iy, iz = _known_cell(q0, q1, q2, index, A, b)
-        if ix < 0:
+        cell = _known_cell(q0, q1, q2, nx, ny, nz, flat, A, b)
+        if cell < 0:
             continue
-        row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
+        row, m2 = _nearest(q0, q1, q2, cell, ny, nz, flat, mean, omega, gate_m2)
         if row >= 0:
             fits[n] = scale2 / (scale2 + m2)
 
@@ -221,16 +220,18 @@ def pulls(
     map axes, rotation first. pull: (M, D), added to: w u' Omega d, with u the motion of a point. weight: (M, D), added
     to: w u' Omega u.
     """
+    nx, ny, nz = index.shape
+    flat = index.reshape(-1)
     for n in range(points.shape[0]):
         p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
         a0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2
         a1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2
         a2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2
         q0, q1, q2 = a0 + t[0], a1 + t[1], a2 + t[2]
-        ix, iy, iz = _known_cell(q0, q1, q2, index, A, b)
-        if ix < 0:
+        cell = _known_cell(q0, q1, q2, nx, ny, nz, flat, A, b)
+        if cell < 0:
             continue
-        row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
+        row, m2 = _nearest(q0, q1, q2, cell, ny, nz, flat, mean, omega, gate_m2)
         if row < 0:
             continue
         o, s = omega[row], scale2 / (scale2 + m2)
@@ -304,34 +305,44 @@ def principal(S: F64, V: F64) -> None:
 
 
 @kernel
+def _by_levers(H: F64, S: F64) -> None:
+    """Fill S (6, 6) with H, turns measured as motion at `LEVER_M`."""
+    for r in range(6):
+        for c in range(6):
+            S[r, c] = H[r, c] / ((LEVER_M if r < 3 else 1.0) * (LEVER_M if c < 3 else 1.0))
+
+
+@kernel
+def _substitute(L: F64, x: F64) -> None:
+    """Divide x (6,) by L L', L (6, 6) a lower triangle."""
+    for r in range(6):
+        for c in range(r):
+            x[r] -= L[r, c] * x[c]
+        x[r] /= L[r, r]
+    for r in range(5, -1, -1):
+        for c in range(r + 1, 6):
+            x[r] -= L[c, r] * x[c]
+        x[r] /= L[r, r]
+
+
+@kernel
 def newton_step(H: F64, g: F64, least: float, step: F64) -> None:
     """Fill `step` (6,) with -H^-1 g without the directions of which H, turns measured at `LEVER_M`, has no more than
     `least` (solution remapping, Zhang et al. 2016). `registration._solve` is the plain twin.
     """
     S, L, V = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6))
+    _by_levers(H, S)
     for r in range(6):
-        for c in range(6):
-            S[r, c] = H[r, c] / ((LEVER_M if r < 3 else 1.0) * (LEVER_M if c < 3 else 1.0))
+        step[r] = -g[r] / (LEVER_M if r < 3 else 1.0)
     if cholesky(S, least, L) and cholesky(S, 0.0, L):  # nearly always: all directions count
-        for r in range(6):
-            step[r] = -g[r] / (LEVER_M if r < 3 else 1.0)
-            for c in range(r):
-                step[r] -= L[r, c] * step[c]
-            step[r] /= L[r, r]
-        for r in range(5, -1, -1):
-            for c in range(r + 1, 6):
-                step[r] -= L[c, r] * step[c]
-            step[r] /= L[r, r]
+        _substitute(L, step)
     else:
         principal(S, V)
+        down = step.copy()
         step[:] = 0.0
         for k in range(6):
             if S[k, k] > least:
-                pull = 0.0
-                for r in range(6):
-                    pull += V[r, k] * g[r] / (LEVER_M if r < 3 else 1.0)
-                for r in range(6):
-                    step[r] -= V[r, k] * pull / S[k, k]
+                step += V[:, k] * ((V[:, k] * down).sum() / S[k, k])
     for r in range(3):
         step[r] /= LEVER_M
 
@@ -413,26 +424,22 @@ def without_hints(H: F64, share: float, constrained: F64) -> bool:
     `LEVER_M`, has less than `share` of the strongest; False where it takes nothing.
     """
     S, V = np.empty((6, 6)), np.empty((6, 6))
-    for r in range(6):
-        for c in range(6):
-            S[r, c] = H[r, c] / ((LEVER_M if r < 3 else 1.0) * (LEVER_M if c < 3 else 1.0))
+    _by_levers(H, S)
     principal(S, V)
+    horizontal = V[3] ** 2 + V[4] ** 2 > 0.5
     strongest = 0.0
     for k in range(6):
-        if V[3, k] * V[3, k] + V[4, k] * V[4, k] > 0.5:
+        if horizontal[k]:
             strongest = max(strongest, S[k, k])
     constrained[:] = 0.0
     takes = False
     for k in range(6):
-        if V[3, k] * V[3, k] + V[4, k] * V[4, k] > 0.5 and S[k, k] <= share * strongest:
+        if horizontal[k] and S[k, k] <= share * strongest:
             takes = True
-            continue
-        for r in range(6):
-            for c in range(6):
-                levers = (LEVER_M if c < 3 else 1.0) / (LEVER_M if r < 3 else 1.0)
-                constrained[r, c] += V[r, k] * V[c, k] * levers
-    if not takes:
-        constrained[:] = 0.0
-        for r in range(6):
-            constrained[r, r] = 1.0
+        else:
+            constrained += np.outer(V[:, k], V[:, k])
+    for r in range(6):
+        for c in range(6):
+            levers = (LEVER_M if c < 3 else 1.0) / (LEVER_M if r < 3 else 1.0)
+            constrained[r, c] = constrained[r, c] * levers if takes else (1.0 if r == c else 0.0)
     return takes

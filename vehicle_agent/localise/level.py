@@ -7,7 +7,7 @@ ground under the wheels, which many layers know better than four wheels do.
 """
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +27,22 @@ _LOOKED_AT: Final = 500
 _TILT_AND_HEIGHT: Final = np.array([0, 1, 5])  # roll, pitch, z of a covariance, rotation first
 
 
+Points = TypeVar("Points", bound=np.generic)
+
+
 def sees_tilt(points_lidar: npt.NDArray[np.generic]) -> bool:
     """Return whether the rays to points (N, 3) of a scan, LiDAR frame, any unit, spread enough in elevation."""
-    some = points_lidar[:: 1 + len(points_lidar) // _LOOKED_AT].astype(np.float64)
+    return spreads(looked_at(points_lidar))
+
+
+def looked_at(points: npt.NDArray[Points]) -> npt.NDArray[Points]:
+    """Those of the points (N, 3) of a scan that are enough to tell; a view."""
+    return points[:: 1 + len(points) // _LOOKED_AT]
+
+
+def spreads(rays: npt.NDArray[np.generic]) -> bool:
+    """Whether rays (N, 3), LiDAR frame, any unit, spread enough in elevation."""
+    some = rays.astype(np.float64)
     horizontal = np.hypot(some[:, 0], some[:, 1])
     far = horizontal > 0.0
     if not far.any():

@@ -41,7 +41,7 @@ from gnd.vehicle_agent.detect.tile_shift import pose_error_of_tile
 from gnd.vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.localise.level import sees_tilt
+from gnd.vehicle_agent.localise.level import looked_at, spreads
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.report.packing import AT_ONCE_BYTES, is_measured, pack
@@ -260,10 +260,11 @@ class Reporter:
         pose = PoseUncertainty.of(scan.estimate)
         self.counts["scans_used"] += 1
         self.counts["points"] += len(segmented.moving)
-        self.counts["moving_points"] += int(segmented.moving.sum())
-        rays = (scan.points_map_m - scan.origins_map_m) @ scan.estimate.T_map_vehicle[:3, :3]
+        self.counts["moving_points"] += int(np.count_nonzero(segmented.moving))
+        rays = looked_at(scan.points_map_m) - looked_at(scan.origins_map_m)
+        along_vehicle = rays @ scan.estimate.T_map_vehicle[:3, :3]
         self.counts["rays"] += self._detector.add_scan(
-            scan.points_map_m, scan.origins_map_m, segmented.moving, pose, sees_heights=sees_tilt(rays)
+            scan.points_map_m, scan.origins_map_m, segmented.moving, pose, sees_heights=spreads(along_vehicle)
         )
         self._T_map_vehicle = scan.estimate.T_map_vehicle
         self._lengthen(scan.t_ns)

@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F32, F64
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PackedRays
 from gnd.vehicle_agent.segment.parameters import PAST_S, SegmentParameters
 from gnd.vehicle_agent.segment.scene import (
     SEGMENT_VOXEL_M,
@@ -56,20 +57,16 @@ class SegmentedScan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LaggedScan:
-    """A scan that waits for later ones, in a third of its memory: points to 10 µm, origins to 0.1 mm."""
+    """A scan that waits for later ones."""
 
     t_ns: int
     estimate: PoseEstimate
-    centre_m: F64
-    points: F32
-    origins: I16
-    origin_step_m: float
+    rays: PackedRays
     objects: Objects | None
 
     def restore(self) -> RefinedScan:
         """The scan as it came."""
-        origins = self.origins * self.origin_step_m + self.centre_m
-        return RefinedScan(self.t_ns, self.points + self.centre_m, origins, self.estimate)
+        return RefinedScan(self.t_ns, *self.rays.restore(), self.estimate)
 
 
 class MotionSegmenter:
@@ -97,12 +94,10 @@ class MotionSegmenter:
         self._images.clear()
 
     def _take(self, scan: RefinedScan) -> None:
-        p, n = self.parameters, len(scan.points_map_m)
-        centre = scan.origins_map_m.mean(axis=0) if n else np.zeros(3)
-        points = (scan.points_map_m - centre).astype(np.float32)
-        origins = (scan.origins_map_m - centre).astype(np.float32)
-        objects = None
-        if n and scan.estimate.health == "good":
+        p, objects = self.parameters, None
+        rays, origins = PackedRays.of(scan.points_map_m, scan.origins_map_m)
+        centre, points = rays.centre_m, rays.points_m
+        if len(points) and scan.estimate.health == "good":
             ground = self._ground.around(points, centre, scan.estimate.T_map_vehicle, self._tan_low)
             objects = find_all_objects(points, origins, ground, self._gap_tan, p)
             self._hear_the_past(scan.t_ns, objects, centre)
@@ -113,12 +108,7 @@ class MotionSegmenter:
                 self._images.append(image)
                 self._gap_tan, self._tan_low = image.gap_tan, image.optics.tan_low
                 self._judge = judge_of(self._gap_tan)
-        step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
-        self._held.append(
-            _LaggedScan(
-                scan.t_ns, scan.estimate, centre, points, np.rint(origins / step_m).astype(np.int16), step_m, objects
-            )
-        )
+        self._held.append(_LaggedScan(scan.t_ns, scan.estimate, rays, objects))
 
     def _hear_the_past(self, t_ns: int, objects: Objects, centre_m: F64) -> None:
         self._thin_out(t_ns)
@@ -140,7 +130,7 @@ class MotionSegmenter:
         p = self.parameters
         for held in self._held:
             if _APART_S * _S <= image.t_ns - held.t_ns <= p.future_s * _S and held.objects is not None:
-                image.vote(held.t_ns, held.objects, held.centre_m, self._judge)
+                image.vote(held.t_ns, held.objects, held.rays.centre_m, self._judge)
 
     def _released(self, until_ns: int | None) -> Iterator[SegmentedScan]:
         while self._held and (until_ns is None or self._held[0].t_ns <= until_ns):
@@ -150,12 +140,12 @@ class MotionSegmenter:
     def _moving(self, held: _LaggedScan) -> Mask:
         objects = held.objects
         if objects is None:
-            return np.zeros(len(held.points), np.bool_)
+            return np.zeros(len(held.rays.points_m), np.bool_)
         moves = decide(objects)
         if not moves.any():
-            return np.zeros(len(held.points), np.bool_)
+            return np.zeros(len(held.rays.points_m), np.bool_)
         table = hash_table(int(moves.sum()))
-        return moving_points(held.points, objects.voxel_of, objects.index, moves, SEGMENT_VOXEL_M, *table)
+        return moving_points(held.rays.points_m, objects.voxel_of, objects.index, moves, SEGMENT_VOXEL_M, *table)
 
 
 def decide(objects: Objects) -> Mask:
