@@ -76,4 +76,4 @@ def resident_mb() -> float:
         with open("/proc/self/statm", "rb", buffering=0) as statm:  # noqa: PTH123 - a hundredth of the time of a Path
             return int(statm.read().split()[1]) * _PAGE_BYTES / 1e6
     except OSError:
-        return psutil.Process(os.getpid()).memory_info().rss / 1e6
+        return float(psutil.Process(os.getpid()).memory_info().rss) / 1e6

@@ -45,7 +45,7 @@ class PackedRays:
 
 
 @kernel
-def _centred(points: F64, starts: F64) -> tuple[F64, F32, F32, float]:
+def _centred(points: F64, starts: F64) -> tuple[F64, F32, F32, np.float32]:
     """Mean of the starts, both from there in float32, and the largest coordinate of a start."""
     centre, n = np.zeros(3), points.shape[0]
     for i in range(n):

@@ -28,6 +28,7 @@ from gnd.fleet_sim.prepare import agent_configs
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.world import read_world
 from gnd.gnd_map.settings import plain_settings
+from gnd.schemas.drive_mcap import read_header
 
 SENSORS: Final = ("vlp16", "hdl32e", "hdl64e")
 WARM_UP_SCANS: Final = 20
@@ -157,6 +158,7 @@ def _simulated(config: FleetConfig, folder: RunFolder, progress: Progress) -> di
 
 
 def _recorded(drive: Path, base_map: Path | None, folder: RunFolder) -> dict[str, Path]:
+    read_header(drive).check_placed()  # a broken file is refused before any process starts
     if base_map is not None:
         copy_store(base_map, folder.store)
     return {drive.stem: drive}

@@ -23,9 +23,9 @@ from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.detect.fit_kernel import point_costs
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.kernels import LEVER_M as LEVER_M_OF_TURNS
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import WITHOUT_WHEELS, RegistrationParameters
-from gnd.vehicle_agent.localise.registration import LEVER_M as LEVER_M_OF_TURNS
 from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, register
 
 _GRID_M: Final = 1.0

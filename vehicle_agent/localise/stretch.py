@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from gnd.gnd_map.arrays import F64, I32
 from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise.influence import SeenScan, influence
+from gnd.vehicle_agent.localise.kernels import LEVER_M
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
+from gnd.vehicle_agent.localise.registration import WHEELS_M, Linearised, linearised
 from gnd.vehicle_agent.localise.stretch_kernels import SHARED, add_matches, add_steps, motions, residuals, solve
 
 N_SHARED: Final = SHARED
