@@ -144,7 +144,7 @@ def test_what_waits_takes_less_than_half_of_the_memory() -> None:
     held = sum(
         array.nbytes
         for h in segmenter._held
-        for array in (h.points, h.origins, h.objects.voxel_of)  # type: ignore[union-attr]
+        for array in (h.rays.points_m, h.rays.starts, h.objects.voxel_of)  # type: ignore[union-attr]
     )
     came = sum(scan.points_map_m.nbytes + scan.origins_map_m.nbytes for scan, _ in labelled)
     assert held < 0.5 * came
