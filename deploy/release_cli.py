@@ -64,11 +64,12 @@ def list_trials(path: StoreLocation, settled: int, as_json: bool) -> None:
 @layer_option
 @json_option
 def show_tile(path: StoreLocation, tile: str, layer: str, as_json: bool) -> None:
-    """All about the trials of TILE (path, number, or lat,lon in degrees)."""
+    """All about the trials of TILE (path, number, or lat,lon in degrees), and what was decided about its changes."""
     tile_id = parse_tile(tile)
     with to_read(path) as store:
         known = store.look(lambda c: trials.of_tile(c, layer, tile_id))
-        if not known:
+        steered = store.look(lambda c: trials.steered(c, layer, tile_id))
+        if not known and not steered:
             raise StoreError(f"no version of tile {tile_id.path} of layer {layer} was ever on trial in {shown(path)}")
         open_trial = store.trials(layer, tile_id.path).get(tile_id)
         said = [] if open_trial is None else store.look(lambda c: trials.health(c, open_trial))
@@ -76,7 +77,7 @@ def show_tile(path: StoreLocation, tile: str, layer: str, as_json: bool) -> None
             "trials": [_told(one) for one in known],
             "vehicles": [asdict(one) for one in said],
             "doubted": [asdict(one) for one in store.look(lambda c: trials.doubted_reports(c, layer, tile_id))],
-            "steered": [asdict(one) for one in store.look(lambda c: trials.steered(c, layer, tile_id))],
+            "steered": [asdict(one) for one in steered],
         }
     show(values, as_json, lambda console: _print_tile(console, values))
 

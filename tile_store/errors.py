@@ -11,6 +11,7 @@ DistrictElsewhere    a district that the store does not own, or that is just mov
 StoreClosed          it was used after close()
 NotPublished         signed versions, and nobody to sign another one
 UnknownVersion       the tile has no such version
+ChangedMeanwhile     a tile has another version than the one that somebody decided about
 UnknownReports       a publication names reports that the store does not hold
 IdTaken              a report has the id of another vehicle's
 """
@@ -85,6 +86,10 @@ class NotPublished(StoreError):
 
 class UnknownVersion(StoreError):
     """The tile has no such version, or retention has removed it."""
+
+
+class ChangedMeanwhile(StoreError):
+    """A tile has another version than the one that somebody looked at and decided about; nothing was done."""
 
 
 class UnknownReports(StoreError):

@@ -29,7 +29,7 @@ def release(store: SqlStore, trial: VersionTrial, who: str, why: str, verdict: V
             return False
         place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
         change(c, "insert_notice", place | {"created_ns": now})
-        trials.steer(c, trial, who, "released", why, now)
+        trials.steer(c, trial.place, who, "released", why, now)
         return True
 
     return store.transact(work)
@@ -46,9 +46,9 @@ def withdraw(store: SqlStore, trial: VersionTrial, who: str, why: str, verdict: 
     def work(c: SqlConnection, now: int) -> bool:
         if not trials.set_state(c, trial, "withdrawn", _text(trial, verdict), now):
             return False
-        trials.doubt(c, trial, report_ids, now)
+        trials.doubt(c, trial.place, report_ids, now)
         versions.rollback(c, trial.layer, trial.tile, trial.base_version, now, store.signing)
-        trials.steer(c, trial, who, "withdrawn", why, now)
+        trials.steer(c, trial.place, who, "withdrawn", why, now)
         return True
 
     return store.transact(work)
@@ -60,7 +60,7 @@ def hold(store: SqlStore, trial: VersionTrial, who: str, why: str, *, paused: bo
     def work(c: SqlConnection, now: int) -> bool:
         if not trials.set_state(c, trial, "paused" if paused else "trial", trial.verdict, now):
             return False
-        trials.steer(c, trial, who, "paused" if paused else "resumed", why, now)
+        trials.steer(c, trial.place, who, "paused" if paused else "resumed", why, now)
         return True
 
     return store.transact(work)
@@ -81,11 +81,11 @@ def clear(store: SqlStore, layer: str, tile: TileId, who: str, why: str) -> int:
     """
 
     def work(c: SqlConnection, now: int) -> int:
-        known = trials.of_tile(c, layer, tile)
+        doubted = [one.version for one in trials.doubted_reports(c, layer, tile) if one.cleared_ns is None]
         cleared = trials.clear_doubts(c, layer, tile, who, now)
-        if not known or not cleared:
+        if not cleared:
             raise StoreError(f"no report about tile {tile.path} of layer {layer} is doubted")
-        trials.steer(c, known[-1], who, "cleared", why, now)
+        trials.steer(c, (layer, tile, max(doubted)), who, "cleared", why, now)
         inbox.merge_again(c, layer, tile, store.timing())
         return cleared
 

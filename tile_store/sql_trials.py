@@ -102,9 +102,13 @@ def health(c: SqlConnection, trial: VersionTrial) -> list[VehicleHealth]:
     return [VehicleHealth(*row) for row in fetch(c, "trial_health", place)]
 
 
-def doubt(c: SqlConnection, trial: VersionTrial, report_ids: Iterable[str], now: int) -> None:
-    """The reports behind a withdrawn version are doubted from now on."""
-    place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
+VersionPlace = tuple[str, TileId, int]
+"""Layer, tile and version."""
+
+
+def doubt(c: SqlConnection, of: VersionPlace, report_ids: Iterable[str], now: int) -> None:
+    """The reports behind a version that was taken back are doubted from now on."""
+    place = {"layer": of[0], "tile": of[1].morton, "version": of[2]}
     post(c, "put_doubted_report", place | {"ids": json.dumps(list(report_ids)), "now": now})
 
 
@@ -123,14 +127,14 @@ def clear_doubts(c: SqlConnection, layer: str, tile: TileId, who: str, now: int)
     return change(c, "clear_doubted", {"layer": layer, "tile": tile.morton, "who": who, "now": now})
 
 
-def steer(c: SqlConnection, trial: VersionTrial, who: str, action: str, why: str, now: int) -> None:
-    """Write down who does what."""
-    place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
+def steer(c: SqlConnection, of: VersionPlace, who: str, action: str, why: str, now: int) -> None:
+    """Write down who does what to a version."""
+    place = {"layer": of[0], "tile": of[1].morton, "version": of[2]}
     post(c, "steer", place | {"who": who, "action": action, "why": why, "now": now})
 
 
 def steered(c: SqlConnection, layer: str, tile: TileId) -> list[Steering]:
-    """Who did what to the trials of a tile, oldest first."""
+    """Who did what to the versions of a tile, oldest first."""
     return [Steering(*row) for row in fetch(c, "steered", {"layer": layer, "tile": tile.morton})]
 
 

@@ -60,6 +60,11 @@ class VersionTrial:
     salt: bytes = field(default=b"", repr=False)
 
     @property
+    def place(self) -> tuple[str, TileId, int]:
+        """Layer, tile and version."""
+        return self.layer, self.tile, self.version
+
+    @property
     def is_open(self) -> bool:
         """Whether it is not settled."""
         return self.state in ("trial", "paused")
@@ -116,7 +121,7 @@ class DoubtedReport:
 
 @dataclass(frozen=True, slots=True)
 class Steering:
-    """Who did what to a tile's trial, and why."""
+    """Who did what to a version of a tile, and why: to a trial, or to a change that somebody looked at."""
 
     at_ns: int
     who: str

@@ -28,12 +28,12 @@ ALIKE_STATES: Final = 0.5
 def clear_confirmed(store: SqlStore, released: VersionTrial, who: str) -> int:
     """Clear the doubts of a tile whose withdrawn version a released one confirms; how many reports that is.
 
-    They are not merged again: the released version says what they said.
+    They are not merged again: the released version says what they said. What an operator doubts an operator clears.
     """
     layer, tile = released.layer, released.tile
     doubted = {one.version for one in _doubted(store, layer, tile)}
     before = [one for one in store.look(lambda c: trials.of_tile(c, layer, tile)) if one.version in doubted]
-    if not before or not all(_is_confirmed(store, one, released) for one in before):
+    if len(before) < len(doubted) or not before or not all(_is_confirmed(store, one, released) for one in before):
         return 0
     return releasing.clear(store, layer, tile, who, f"version {released.version} passed its trial and says the same")
 

@@ -6,7 +6,7 @@ a report's id holds the time of its drive.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, Final, Literal
 
@@ -23,6 +23,7 @@ from gnd.gnd_map.similarity import similarity
 from gnd.gnd_map.tile import diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.errors import StoreError
+from gnd.tile_store.judging import ChangedTile
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import StoredTile
 
@@ -66,6 +67,7 @@ class Change:
         confidence: share of its voxels that two or more vehicles reported; None: it comes from a survey.
         tiles: the paths of its tiles.
         outline_deg: (5, 2) longitude and latitude of the corners of its footprint, counter-clockwise, closed.
+        parts: what it is in each of its tiles that the new state has, by number.
     """
 
     change: What
@@ -86,11 +88,12 @@ class Change:
     confidence: float | None
     tiles: tuple[str, ...]
     outline_deg: F64 = field(repr=False, compare=False)
+    parts: tuple[ChangedTile, ...] = field(default=(), repr=False, compare=False)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-able, without the outline."""
-        values = asdict(self)
-        del values["outline_deg"]
+        """JSON-able, without the outline and the parts."""
+        values = asdict(replace(self, parts=()))
+        del values["outline_deg"], values["parts"]
         for name in ("first_seen", "last_seen"):
             values[name] = None if values[name] is None else values[name].isoformat().replace("+00:00", "Z")
         return values | {"tiles": ",".join(self.tiles)}
@@ -111,6 +114,7 @@ class _Source:
     vehicle_of: Mapping[str, str]
     reports_of: Mapping[int, tuple[str, ...]]  # voxel -> report ids
     surveyed_ns: int | None
+    versions: tuple[int, int] = (0, 0)  # before and after; 0: not there
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +199,7 @@ class _Reporters:
     def source(self, stored: StoredTile | None, since: int) -> _Source:
         """Reports of each voxel in the versions after `since`, and the survey of a base."""
         if stored is None:
-            return _Source({}, {}, None)
+            return _Source({}, {}, None, (since, 0))
         reports: dict[int, set[str]] = {}
         for line in self._store.history(self._layer, stored.tile):
             if since < line.version <= stored.version:
@@ -205,7 +209,8 @@ class _Reporters:
         if reports and self._vehicle_of is None:
             self._vehicle_of = {row.report_id: row.vehicle for row in self._store.reports(self._layer)}
         surveyed = stored.surveyed_ns if stored.kind == "base" else None
-        return _Source(self._vehicle_of or {}, {v: tuple(sorted(ids)) for v, ids in reports.items()}, surveyed)
+        told = {voxel: tuple(sorted(ids)) for voxel, ids in reports.items()}
+        return _Source(self._vehicle_of or {}, told, surveyed, (since, stored.version))
 
 
 def _changed(
@@ -283,7 +288,21 @@ def _change(what: What, voxels: list[tuple[_VoxelTable, int]], frame: LocalFrame
         confidence=seen[4],
         tiles=tuple(sorted({one.tile.path for one, _ in voxels})),
         outline_deg=np.stack([np.degrees(lon), np.degrees(lat)], axis=1),
+        parts=tuple(_parts(voxels)),
     )
+
+
+def _parts(voxels: list[tuple[_VoxelTable, int]]) -> Iterator[ChangedTile]:
+    """What a change is in each of its tiles."""
+    by_tile: dict[int, list[tuple[_VoxelTable, int]]] = {}
+    for one, i in voxels:
+        by_tile.setdefault(one.tile.morton, []).append((one, i))
+    for _, rows in sorted(by_tile.items()):
+        source, tile = rows[0][0].source, rows[0][0].tile
+        ids = tuple(sorted(int(one.voxel_id[i]) for one, i in rows))
+        reports = {name for voxel in ids for name in source.reports_of.get(voxel, ())}
+        if source.versions[0] < source.versions[1]:
+            yield ChangedTile(tile, *source.versions, ids, tuple(sorted(reports)))
 
 
 def _box(mean_m: F64, cov_m2: F64, count: I64) -> tuple[F64, F64, F64]:

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import gzip
 import hashlib
+import json
 import mimetypes
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
@@ -24,12 +25,16 @@ from gnd.deploy.serve.guard import PageAddress, PageGuard
 from gnd.deploy.serve.page_map import PageMap, number_of, tile_of
 from gnd.deploy.serve.page_vehicles import PageVehicles
 from gnd.deploy.serve.panels import Panels
+from gnd.deploy.serve.rights import PageRights
 from gnd.extras import MissingExtra
 from gnd.gnd_map.errors import GndError
-from gnd.tile_store.errors import UnknownVersion
+from gnd.tile_store.errors import ChangedMeanwhile, UnknownVersion
+from gnd.tile_store.judging import LONGEST_WHY
 
 PAGE: Final = ("index.html", "page.js", "page.css", "icon.svg")
 FOREVER: Final = "private, max-age=31536000, immutable"
+DECISION_BYTES: Final = 4096
+"""A decision with its reason is no longer."""
 SAYS_BYTES: Final = 1024
 """A browser says no more than this at once: it has nothing to say but that it is there."""
 _LEAST_PACKED: Final = 512
@@ -53,7 +58,9 @@ class PageParts:
     replay: float = 0.0
 
 
-def page_app(parts: PageParts, hub: BrowserHub, follower: PageFollower, address: PageAddress) -> Starlette:
+def page_app(
+    parts: PageParts, hub: BrowserHub, follower: PageFollower, address: PageAddress, rights: PageRights
+) -> Starlette:
     """The application."""
     questions = _Questions(parts, hub, follower)
 
@@ -67,11 +74,12 @@ def page_app(parts: PageParts, hub: BrowserHub, follower: PageFollower, address:
     routes = [
         *_page_routes(),
         *(Route(f"/api/{path}", _answer(ask)) for path, ask in questions.table().items()),
+        Route("/api/changes/{key}", questions.decide, methods=["POST"]),
         Route("/api/overview.bin", questions.overview),
         Route("/api/tiles/{tile:int}/{version:int}.bin", questions.packed),
         WebSocketRoute("/api/live", questions.live),
     ]
-    return Starlette(routes=routes, middleware=[Middleware(PageGuard, address=address)], lifespan=life)
+    return Starlette(routes=routes, middleware=[Middleware(PageGuard, address=address, rights=rights)], lifespan=life)
 
 
 def _page_routes() -> list[Route]:
@@ -129,9 +137,8 @@ def _answer(ask: Callable[[Request], Any]) -> Callable[[Request], Response]:
 
 def refusal(error: GndError) -> Response:
     """An error as an answer."""
-    status = 404 if isinstance(error, UnknownVersion) else 400 if isinstance(error, BadQuestion) else 503
-    if isinstance(error, MissingExtra):
-        status = 501
+    kinds = ((UnknownVersion, 404), (BadQuestion, 400), (ChangedMeanwhile, 409), (MissingExtra, 501))
+    status = next((number for kind, number in kinds if isinstance(error, kind)), 503)
     return JSONResponse({"error": str(error)}, status)
 
 
@@ -145,8 +152,9 @@ class _Questions:
         """By path, what gives plain values."""
         shown, panels, vehicles = self._parts.shown, self._parts.panels, self._parts.vehicles
         return {
-            "map": lambda _: shown.about() | {"live": self._follower.is_live, "replay": self._parts.replay},
+            "map": self._about,
             "tiles": lambda asked: shown.tiles(_box_of(asked)),
+            "tiles/{tile}": lambda asked: shown.tile(tile_of(asked.path_params["tile"])),
             "tiles/{tile}/history": lambda asked: shown.history(tile_of(asked.path_params["tile"])),
             "voxel/{tile}/{voxel}": self._voxel,
             "features/{layer}": lambda asked: shown.features(asked.path_params["layer"]),
@@ -156,6 +164,26 @@ class _Questions:
             "vehicles": lambda _: vehicles.all(),
             "ways": lambda _: vehicles.ways(),
         }
+
+    def _about(self, asked: Request) -> dict[str, Any]:
+        viewer = asked.state.viewer
+        told = {"live": self._follower.is_live, "replay": self._parts.replay}
+        return self._parts.shown.about() | told | {"viewer": viewer.name, "may_decide": viewer.may_decide}
+
+    async def decide(self, request: Request) -> Response:
+        """Somebody decides about a change; the guard has seen to it that they may."""
+        work, panels = self._parts.panels.work, self._parts.panels
+        try:
+            judgement, why = _decision_of(await _body_of(request))
+            who = request.state.viewer.name
+            await asyncio.to_thread(work.decide, request.path_params["key"], judgement, who, why)
+        except GndError as error:
+            return refusal(error)
+        finally:
+            panels.changes.forget()
+        self._follower.look_soon()
+        self._hub.tell({"type": "decided"})
+        return JSONResponse({"done": judgement})
 
     def overview(self, request: Request) -> Response:
         """All tiles; see `PageMap.overview`."""
@@ -205,6 +233,35 @@ async def _hear(socket: WebSocket) -> None:
     with contextlib.suppress(WebSocketDisconnect):
         while True:
             await socket.receive_text()
+
+
+async def _body_of(request: Request) -> bytes:
+    """What was sent, if it is no longer than a decision is."""
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > DECISION_BYTES:
+            raise BadQuestion(f"a decision of more than {DECISION_BYTES} bytes")
+    return body
+
+
+def _decision_of(body: bytes) -> tuple[str, str]:
+    """What is decided, and why, in one line.
+
+    Raises:
+        BadQuestion: it is no decision.
+    """
+    try:
+        told = json.loads(body)
+        judgement, why = told["judgement"], told["why"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise BadQuestion("a decision is a JSON object of judgement and why") from None
+    if not isinstance(judgement, str) or not isinstance(why, str):
+        raise BadQuestion("judgement and why are texts")
+    line = " ".join(why.split())
+    if not line.isprintable() or len(line) > LONGEST_WHY:
+        raise BadQuestion(f"the reason is at most {LONGEST_WHY} characters that can be printed, not {len(line)}")
+    return judgement, line
 
 
 def _box_of(asked: Request) -> tuple[float, float, float, float]:

@@ -2,7 +2,9 @@
 
 import contextlib
 import logging
+import secrets
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,10 +28,13 @@ from gnd.deploy.serve.guard import PageAddress, token_of
 from gnd.deploy.serve.page_map import PageMap
 from gnd.deploy.serve.page_vehicles import PageVehicles, run_is_going
 from gnd.deploy.serve.panels import Panels
+from gnd.deploy.serve.rights import PageRights, PeerProtocol
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.gnd_map.features import is_feature_layer
 from gnd.tile_store.location import LOCATION, StoreLocation, open_store, shown
 from gnd.tile_store.options import layer_option
+from gnd.tile_store.signing import Signing
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_LAYER
 
 END_S: Final = 2
@@ -88,7 +93,12 @@ class PageServer(uvicorn.Server):
 
 
 def serve_page(
-    source: PageSource, address: PageAddress, stop: threading.Event, tell: Callable[[str], None] = lambda _: None
+    source: PageSource,
+    address: PageAddress,
+    stop: threading.Event,
+    tell: Callable[[str], None] = lambda _: None,
+    *,
+    allow_changes: bool = False,
 ) -> None:
     """Show a map until `stop` is set.
 
@@ -97,6 +107,7 @@ def serve_page(
         address: where.
         stop: ends it.
         tell: called with the page's address when it can be opened.
+        allow_changes: whether who has the token, or an operator's certificate, may decide about changes of the map.
 
     Raises:
         StoreUnavailable: there is no such store.
@@ -107,24 +118,31 @@ def serve_page(
         title = source.run.root.resolve().name if source.run else Path(shown(source.source)).name
         page_map, hub = PageMap(opened, source.layer, title), BrowserHub()
         vehicles = PageVehicles(source.run, page_map.place, page_map.ground_m)
-        panels = Panels.of(page_map, source.run)
+        rights = PageRights(allow_changes, address.roles)
+        panels = Panels.of(page_map, source.run, stack.enter_context(_writing(source)) if allow_changes else None)
 
         def status() -> dict[str, Any]:
             return panels.status.get() if hub.count else {}
 
         follower = PageFollower(page_map, vehicles, hub.tell, connect=source.endpoint, run=source.run, status=status)
-        app = page_app(PageParts(page_map, vehicles, panels, source.replay), hub, follower, address)
+        app = page_app(PageParts(page_map, vehicles, panels, source.replay), hub, follower, address, rights)
         listening = stack.enter_context(_listening(address))
         port = int(listening.getsockname()[1])
-        _run(_server_of(app, address), listening, stop, lambda: tell(address.url(port)))
+        _run(_server_of(app, address, rights), listening, stop, lambda: tell(address.url(port)))
 
 
-def _server_of(app: Starlette, address: PageAddress) -> PageServer:
+def _writing(source: PageSource) -> SqlStore:
+    """The store to decide in: what is published there is signed by this process's identity, where it has one."""
+    return open_store(store_of(source.source), create=False, signing=Signing.of_environment())
+
+
+def _server_of(app: Starlette, address: PageAddress, rights: PageRights) -> PageServer:
     return PageServer(
         uvicorn.Config(
             app,
             log_level="warning",
             access_log=False,
+            http=PeerProtocol,
             ws="websockets-sansio",
             ws_max_size=SAYS_BYTES,
             server_header=False,
@@ -132,6 +150,8 @@ def _server_of(app: Starlette, address: PageAddress) -> PageServer:
             timeout_graceful_shutdown=END_S,
             ssl_certfile=None if address.certificate is None else str(address.certificate),
             ssl_keyfile=None if address.key is None else str(address.key),
+            ssl_ca_certs=rights.trusted,
+            ssl_cert_reqs=ssl.CERT_NONE if rights.trusted is None else ssl.CERT_OPTIONAL,
         )
     )
 
@@ -177,6 +197,10 @@ def _listening(address: PageAddress) -> Iterator[socket.socket]:
 @click.option("--token-file", type=PATH, help="File with the token that every request must bring.")
 @click.option("--certificate", type=PATH, help="Certificate of the server (PEM): HTTPS.")
 @click.option("--key", type=PATH, help="Its key (PEM).")
+@click.option("--allow-changes", is_flag=True, help="Let who has the token accept, doubt and roll back changes.")
+@click.option(
+    "--roles", type=PATH, help="Identity folder (`gnd certs`): its fleet's members look, its operators decide."
+)
 @click.option(
     "--replay",
     type=click.FloatRange(0.0, 1000.0),
@@ -193,21 +217,27 @@ def serve(
     token_file: Path | None,
     certificate: Path | None,
     key: Path | None,
+    allow_changes: bool,
+    roles: Path | None,
     replay: float,
     layer: str,
 ) -> None:
     """Show the map of RUN (the folder of a run) or STORE in the browser: every Gaussian, vehicles as they drive,
     updates as they are published, every version before.
 
-    Nothing is changed by it. Only this machine reaches it, unless --listen says otherwise, which needs a token and a
-    certificate. Ctrl-C ends it.
+    Nothing is changed by it unless --allow-changes says so: then whoever opens the page with its token (one is made up
+    where --token-file gives none), or with --roles whoever brings an operator's certificate, may accept, doubt and
+    roll back changes. Only this machine reaches it, unless --listen says otherwise, which needs a certificate, and a
+    token or --roles. Ctrl-C ends it.
     """
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(message)s")
     token = "" if token_file is None else token_of(token_file)
-    address = PageAddress(host, port, names, token, certificate, key)
+    made = secrets.token_hex(32) if allow_changes and not token and roles is None else ""
+    address = PageAddress(host, port, names, token or made, certificate, key, roles)
     with ending_in_order() as stop:
-        serve_page(PageSource(source, layer, connect, replay), address, stop, _say)
+        source_shown = PageSource(source, layer, connect, replay)
+        serve_page(source_shown, address, stop, lambda url: _say(url, made), allow_changes=allow_changes)
 
 
-def _say(url: str) -> None:
-    click.echo(f"the map is at {url}  (Ctrl-C ends)")
+def _say(url: str, token: str) -> None:
+    click.echo(f"the map is at {url}{f'?token={token}' if token else ''}  (Ctrl-C ends)")

@@ -70,6 +70,10 @@ class PageFollower:
         """Begin."""
         self._thread.start()
 
+    def look_soon(self) -> None:
+        """Look at the whole store with the next round: somebody has just changed it. May be called from any thread."""
+        self._next_s["look"] = 0.0
+
     def close(self) -> None:
         """End it. May be called again."""
         self._stop.set()

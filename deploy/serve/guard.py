@@ -2,7 +2,7 @@
 
 A page of somebody else's that a browser on this machine has open may send requests here, under a name of its own that
 leads to this address (DNS rebinding): the name that it asks for tells it from ours. A WebSocket names the page that
-opens it.
+opens it, and so does whatever would change something: without our own address as its origin it is refused.
 """
 
 import hmac
@@ -21,6 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
 
 from gnd.deploy.errors import ServeError
+from gnd.deploy.serve.rights import PageRights, Viewer
 from gnd.fleet_bus.config import PLAIN_VARIABLE
 
 COOKIE: Final = "gnd_page"
@@ -50,6 +51,7 @@ class PageAddress:
         token: what every request must bring; "": nothing.
         certificate: PEM of the server's certificate; None: plain HTTP.
         key: PEM of its key.
+        roles: identity folder of the fleet whose members may ask by their certificates; None: the token tells.
     """
 
     host: str = "127.0.0.1"
@@ -58,6 +60,7 @@ class PageAddress:
     token: str = field(default="", repr=False)
     certificate: Path | None = None
     key: Path | None = None
+    roles: Path | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65_535:
@@ -66,11 +69,14 @@ class PageAddress:
             raise ServeError("a certificate needs its key, and a key its certificate")
         if self.token and len(self.token) < LEAST_TOKEN:
             raise ServeError(f"the token has {len(self.token)} characters, need {LEAST_TOKEN}: `openssl rand -hex 32`")
+        if self.roles is not None and self.certificate is None:
+            raise ServeError("members of a fleet show their certificates in TLS alone: --roles needs --certificate")
         if self.is_loopback:
             return
-        if not self.token:
+        if not self.token and self.roles is None:
             raise ServeError(
-                f"{self.host} reaches beyond this machine: whoever gets there would see the map; give --token-file"
+                f"{self.host} reaches beyond this machine: whoever gets there would see the map; give --token-file,"
+                " or --roles"
             )
         if self.certificate is None and os.environ.get(PLAIN_VARIABLE) != "1":
             raise ServeError(
@@ -110,12 +116,13 @@ class PageGuard:
     """Refuses what is not asked of our own address, or without the token; gives every answer its headers.
 
     Args:
-        app: what is behind it.
+        app: what is behind it; it finds who asks as `viewer` in the request's state.
         address: where the page is.
+        rights: who may do what.
     """
 
-    def __init__(self, app: ASGIApp, address: PageAddress) -> None:
-        self._app, self._address = app, address
+    def __init__(self, app: ASGIApp, address: PageAddress, rights: PageRights) -> None:
+        self._app, self._address, self._rights = app, address, rights
         own = ("localhost", "127.0.0.1", "::1") if address.is_loopback else ()
         self._names = {one.lower() for one in (*own, address.host, *address.names)}
 
@@ -125,7 +132,9 @@ class PageGuard:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        refusal = self._refusal(scope, headers)
+        viewer = self._rights.viewer(scope.get("state", {}))
+        scope.setdefault("state", {})["viewer"] = viewer
+        refusal = self._refusal(scope, headers, viewer)
         if refusal is None:
             await self._app(scope, receive, send if scope["type"] == "websocket" else _with_headers(send))
         elif scope["type"] == "websocket":
@@ -136,17 +145,32 @@ class PageGuard:
             status, text = refusal
             await JSONResponse({"error": text}, status)(scope, receive, _with_headers(send))
 
-    def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
+    def _refusal(self, scope: Scope, headers: Headers, viewer: Viewer) -> tuple[int, str] | None:
         if self._name_of(headers.getlist("host")) not in self._names:
             return 421, "this host name is not ours: --name gives the page another"
         origin = headers.get("origin")
         if origin is not None and urlsplit(origin).netloc.lower() != headers["host"].lower():
             return 403, "another site's page asks"
-        if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
+        is_question = scope["type"] != "http" or scope["method"] in ("GET", "HEAD")
+        if not is_question and not (scope["method"] == "POST" and self._rights.allow_changes):
             return 405, "the map is only shown: GET"
-        if self._address.token and not self._has_token(headers):
-            return 401, "open the page with ?token=… once"
-        return None
+        is_known = viewer.is_member or (self._has_token(headers) if self._address.token else self._rights.roles is None)
+        if not is_known:
+            return (
+                401,
+                "open the page with ?token=… once" if self._address.token else "bring a certificate of the fleet",
+            )
+        return None if is_question else self._refusal_to_change(scope, headers, viewer)
+
+    def _refusal_to_change(self, scope: Scope, headers: Headers, viewer: Viewer) -> tuple[int, str] | None:
+        """A form of another site's sends neither our origin nor JSON, and a script of its has to ask first (CORS)."""
+        if headers.get("origin", "").lower() != f"{scope['scheme']}://{headers['host']}".lower():
+            return 403, "whoever changes something says from which page: ours"
+        if headers.get("sec-fetch-site", "same-origin") != "same-origin":
+            return 403, "another site's page asks"
+        if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+            return 415, "what changes something is JSON"
+        return None if viewer.may_decide else (403, f"{viewer.name} only looks: operators decide")
 
     def _name_of(self, hosts: Iterable[str]) -> str:
         named = list(hosts)

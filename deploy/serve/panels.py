@@ -7,23 +7,18 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from math import radians
 from typing import Any, Final, Generic, TypeVar
 
-from gnd.deploy.map_export.changes import Change, map_changes
 from gnd.deploy.run_folder import RunFolder
 from gnd.deploy.serve.page_map import PageMap
+from gnd.deploy.serve.work_list import WorkList
 from gnd.fleet_bus.errors import LedgerError
 from gnd.fleet_bus.ledger_file import read_run
 from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals
-from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.status import WORDS, status_of
 
-MOST_CHANGES: Final = 500
-MOST_CHANGED_TILES: Final = 2_000
-"""Of a large map the work list names the changes of the tiles that changed last."""
 MOST_ROWS: Final = 100
 _KEPT_S: Final = 2.0
 _SHARE: Final = 0.1
@@ -52,32 +47,10 @@ class KeptAnswer(Generic[_T]):
                 self._until_s = end_s + max(_KEPT_S, (end_s - begin_s) / _SHARE)
             return self._value[0]
 
-
-def changes(shown: PageMap) -> dict[str, Any]:
-    """Object-like clusters of what changed since the survey, largest first, each with its place in the map's frame.
-
-    Raises:
-        MissingExtra: scikit-learn is not installed.
-    """
-    columns = shown.heads.columns
-    rows = [row for row in columns.created_ns.argsort()[::-1].tolist() if columns.version[row] > 1]
-    tiles = [TileId(int(columns.morton[row])) for row in rows[:MOST_CHANGED_TILES]]
-    if not tiles:
-        return {"changes": [], "alone": 0, "left_out": 0}
-    found = map_changes(shown.store, shown.store, layer=shown.layer, old_at_ns=_surveyed_ns(shown, tiles), only=tiles)
-    listed = [_change(shown, one) for one in found.changes[:MOST_CHANGES]]
-    return {"changes": listed, "alone": found.alone, "left_out": len(found.changes) - len(listed)}
-
-
-def _surveyed_ns(shown: PageMap, tiles: list[TileId]) -> int:
-    """When the last of some tiles was put into the map by a survey; of tiles that vehicles have made nothing counts."""
-    first = [shown.store.history(shown.layer, tile)[0] for tile in tiles]
-    return max((line.created_ns for line in first if line.kind == "base"), default=0)
-
-
-def _change(shown: PageMap, one: Change) -> dict[str, Any]:
-    at = shown.frame.enu_from_geodetic(radians(one.lat_deg), radians(one.lon_deg), one.height_m)
-    return one.as_dict() | {"at_m": [round(float(x), 2) for x in at]}
+    def forget(self) -> None:
+        """Compute it anew when it is asked for next."""
+        with self._lock:
+            self._value = []
 
 
 def traffic(run: RunFolder | None) -> dict[str, Any]:
@@ -131,18 +104,23 @@ class Panels:
     """What stands beside one map.
 
     Attributes:
-        changes, traffic, status: each as the function of that name gives it.
+        work: the work list, and who writes to it.
+        changes: the work list as it was a moment ago.
+        traffic, status: each as the function of that name gives it.
     """
 
+    work: WorkList
     changes: KeptAnswer[dict[str, Any]]
     traffic: KeptAnswer[dict[str, Any]]
     status: KeptAnswer[dict[str, Any]]
 
     @classmethod
-    def of(cls, shown: PageMap, run: RunFolder | None) -> "Panels":
-        """The panels of a map."""
+    def of(cls, shown: PageMap, run: RunFolder | None, writing: SqlStore | None = None) -> "Panels":
+        """The panels of a map; `writing` is its store where decisions may be taken."""
+        work = WorkList(shown, writing)
         return cls(
-            KeptAnswer(lambda: changes(shown)),
+            work,
+            KeptAnswer(work.compute),
             KeptAnswer(lambda: traffic(run)),
             KeptAnswer(lambda: status(shown.store)),
         )

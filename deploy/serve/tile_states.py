@@ -2,7 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -90,7 +90,14 @@ class TileStates:
         gaussians = stored.decode_gaussians().gaussians
         if before is None or stored.kind == "base":
             return _surveyed(stored, gaussians)
-        return _merged(stored, gaussians, before, self._store.voxel_provenance(self._layer, tile, version))
+        state = _merged(stored, gaussians, before, self._store.voxel_provenance(self._layer, tile, version))
+        return state if stored.kind == "merged" else _given_back(state, self._survey(tile, version))
+
+    def _survey(self, tile: TileId, version: int) -> PageTile | None:
+        """The latest survey before a version."""
+        lines = self._store.history(self._layer, tile)
+        bases = [line.version for line in lines if line.kind == "base" and line.version < version]
+        return self.state(tile, bases[-1]) if bases else None
 
     def _known(self, tile: TileId, version: int) -> PageTile | None:
         with self._lock:
@@ -147,3 +154,18 @@ def _merged(
     if len(before.kind):  # what was new once and is changed again is still new since the survey
         kind[is_put & was_there & (before.kind[place] == NEW)] = NEW
     return PageTile(stored.tile, stored.version, gaussians, kind, since_s, since_version, reports)
+
+
+def _given_back(state: PageTile, survey: PageTile | None) -> PageTile:
+    """What a rollback has made as it was surveyed is as surveyed again."""
+    if survey is None:
+        return state
+    ids = state.gaussians.voxel_id
+    differs = np.isin(ids, diff(survey.gaussians, state.gaussians).put.voxel_id)
+    is_back = np.isin(ids, survey.gaussians.voxel_id) & ~differs
+    place = np.searchsorted(survey.gaussians.voxel_id, ids[is_back])
+    told = {}
+    for name in ("kind", "since_s", "since_version", "reports"):
+        told[name] = getattr(state, name).copy()
+        told[name][is_back] = getattr(survey, name)[place]
+    return replace(state, **told)

@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from suite_ports import new_port
@@ -82,11 +83,7 @@ class LiveStreet:
 
     def merge(self, content: Tile, vehicle: str = "vehicle-07", *, quietly: bool = False) -> int:
         """Report a tile as it is now, merge the report, and publish the version; its number."""
-        head = self.store.get("ndt", content.tile_id)
-        assert head is not None
-        before = head.decode_gaussians().gaussians
-        row, changed = self._report(head.version, head.sha, content, before, vehicle)
-        assert self.store.put_reports([row]) == ["stored"]
+        row, changed = self._put(content, vehicle)
         (claim,) = self.store.claim("shard-0", 10, 30.0)
         work = self.store.load(claim)
         said = {int(voxel): (row.report_id,) for voxel in changed}
@@ -99,6 +96,18 @@ class LiveStreet:
         if not quietly:
             self.announce(content.tile_id, result.version)
         return result.version
+
+    def put_report(self, content: Tile, vehicle: str = "vehicle-07") -> ReportRow:
+        """Report a tile as it is now, without merging it."""
+        return self._put(content, vehicle)[0]
+
+    def _put(self, content: Tile, vehicle: str) -> tuple[ReportRow, list[int]]:
+        head = self.store.get("ndt", content.tile_id)
+        assert head is not None
+        before = head.decode_gaussians().gaussians
+        row, changed = self._report(head.version, head.sha, content, before, vehicle)
+        assert self.store.put_reports([row]) == ["stored"]
+        return row, changed
 
     def announce(self, tile: TileId, version: int) -> None:
         new, old = (self.store.get("ndt", tile, one) for one in (version, version - 1))
@@ -164,7 +173,7 @@ class Answer:
 class ServedPage:
     """`gnd serve` in a process of its own."""
 
-    def __init__(self, source: Path, *arguments: str) -> None:
+    def __init__(self, source: Path | str, *arguments: str) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "gnd.deploy.cli", "serve", str(source), "--port", "0", *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
@@ -173,7 +182,9 @@ class ServedPage:
         self._said: queue.Queue[str | None] = queue.Queue()
         threading.Thread(target=self._read, daemon=True).start()
         self.url = self._address()
-        self.port = int(self.url.rsplit(":", 1)[1].strip("/"))
+        told = urlsplit(self.url)
+        assert told.port is not None
+        self.port, self.token = told.port, parse_qs(told.query).get("token", [""])[0]
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -205,9 +216,25 @@ class ServedPage:
             connection.close()
 
     def value(self, path: str) -> Any:
-        answer = self.get(path)
+        answer = self.get(path, **({"Authorization": f"Bearer {self.token}"} if self.token else {}))
         assert answer.status == 200, answer.body
         return answer.value
+
+    def decide(self, key: str, judgement: str, why: str = "", **headers: str) -> Answer:
+        """Decide about a change as the page does; headers may be others, "" leaves one out."""
+        own = {"Origin": f"http://127.0.0.1:{self.port}", "Content-Type": "application/json",
+               "Authorization": f"Bearer {self.token}"}  # fmt: skip
+        told = {name.replace("_", "-"): value for name, value in headers.items()}
+        return self.post(f"/api/changes/{key}", json.dumps({"judgement": judgement, "why": why}).encode(), own | told)
+
+    def post(self, path: str, body: bytes, headers: dict[str, str]) -> Answer:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        try:
+            connection.request("POST", path, body, {name: one for name, one in headers.items() if one})
+            got = connection.getresponse()
+            return Answer(got.status, {name.lower(): one for name, one in got.getheaders()}, got.read())
+        finally:
+            connection.close()
 
     def end(self, number: int = signal.SIGTERM) -> int:
         if self.process.poll() is None:
@@ -223,7 +250,7 @@ class ServedPage:
 
 
 @contextmanager
-def served(source: Path, *arguments: str) -> Iterator[ServedPage]:
+def served(source: Path | str, *arguments: str) -> Iterator[ServedPage]:
     page = ServedPage(source, *arguments)
     try:
         yield page
