@@ -15,6 +15,8 @@ export interface About {
   feature_layers: string[];
   live: boolean;
   replay: number;
+  viewer: string;
+  may_decide: boolean;
 }
 
 export interface TileInfo {
@@ -70,6 +72,26 @@ export interface Change {
   confidence: number | null;
   first_seen: string | null;
   last_seen: string | null;
+  /** Names the change as long as it is of the same voxels; "": it cannot be decided about. */
+  key: string;
+  parts: { tile: number; before: number; version: number }[];
+  accepted: Decision | null;
+}
+
+export interface Decision {
+  key: string;
+  at_ms: number;
+  who: string;
+  judgement: string;
+  why: string;
+  tiles: number;
+}
+
+export interface WorkList {
+  changes: Change[];
+  alone: number;
+  left_out: number;
+  decided: Decision[];
 }
 
 export interface Feature {
@@ -87,10 +109,11 @@ export type Message =
   | { type: "vehicles"; vehicles: Vehicle[] }
   | { type: "status"; status: any }
   | { type: "ended" }
+  | { type: "decided" }
   | { type: "reload" };
 
-async function asked(path: string): Promise<Response> {
-  const answer = await fetch(path, { credentials: "same-origin" });
+async function asked(path: string, more: RequestInit = {}): Promise<Response> {
+  const answer = await fetch(path, { credentials: "same-origin", ...more });
   if (!answer.ok) {
     const told = await answer.json().catch(() => ({}));
     throw new Error(told.error ?? `the server answers ${answer.status}`);
@@ -104,6 +127,10 @@ export async function ask<T>(path: string): Promise<T> {
 
 export async function askBytes(path: string): Promise<ArrayBuffer> {
   return (await asked(`api/${path}`)).arrayBuffer();
+}
+
+export async function post(path: string, what: unknown): Promise<void> {
+  await asked(`api/${path}`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(what) });
 }
 
 /** Follows the server for ever; a lost connection is made anew, ever more patiently. */

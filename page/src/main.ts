@@ -7,10 +7,12 @@ import { byId, facts, make, many, swatch, when } from "./dom";
 import { looks } from "./gaussians";
 import { Frame } from "./geodesy";
 import { Features, Overview, selection, Vehicles } from "./overlays";
-import { changeItems, cloudPanel, fleetItems, trafficPanel, voxelPanel } from "./panels";
+import { cloudPanel, fleetItems, trafficPanel, voxelPanel } from "./panels";
+import { Pictures } from "./pictures";
 import { type Hit, Tiles } from "./tiles";
 import { Timeline } from "./timeline";
 import { View } from "./view";
+import { WorkList } from "./worklist";
 
 const MODE_WORDS: Record<Mode, string> = { change: "Change", height: "Height", surface: "Surface", age: "Age", evidence: "Evidence" };
 const THEMES = { dark: { map: "#0b1115", flash: "#ffffff" }, light: { map: "#e9eef1", flash: "#ff5a00" } };
@@ -26,6 +28,8 @@ class Page {
   private readonly timeline: Timeline;
   private readonly looks = looks();
   private readonly marker = selection();
+  private readonly pictures: Pictures;
+  private readonly work: WorkList;
   private mode: Mode = "change";
   private panel = "view";
   private isOpen = false;
@@ -35,7 +39,6 @@ class Page {
   private hashTimer = 0;
   private arranged = 0;
   private slow = { frames: 0, since: 0 };
-  private changeFilter: string = "all";
   private readonly shades: Shades;
   /** For measurements: when the last update was published, heard and drawn, POSIX ms. */
   readonly updates: { version: number; tile: number; created_ms: number; heard_ms: number; drawn_ms: number }[] = [];
@@ -52,6 +55,8 @@ class Page {
     this.view = new View(byId("map"), this.tiles.before.group, after, (now_s) => this.onFrame(now_s));
     this.view.scene.add(this.overview.group, this.vehicles.group, this.features.group, this.marker);
     this.timeline = new Timeline(() => this.onTime());
+    this.pictures = new Pictures(this.view.renderer, this.looks, (info, version) => this.tiles.packedOf(info, version));
+    this.work = new WorkList(about, this.pictures, (one) => this.goTo(one), (text) => this.note(text));
     this.begin();
   }
 
@@ -249,6 +254,9 @@ class Page {
         this.badge();
         this.note("The run has ended. Its map stays here.");
         break;
+      case "decided":
+        if (this.panel === "changes") void this.guarded("The changes could not be read", this.work.read());
+        break;
       case "reload":
         void this.catchUp();
         break;
@@ -395,7 +403,7 @@ class Page {
   private refreshPanel(isNew = false): void {
     if (!isNew && (document.hidden || !this.isLive)) return;
     const reading: Record<string, () => Promise<void>> = {
-      changes: () => this.changesPanel(),
+      changes: () => this.work.read(isNew),
       traffic: async () => byId("traffic").replaceChildren(...trafficPanel(await ask("traffic"))),
       cloud: async () => byId("cloud").replaceChildren(...cloudPanel(await ask("status"))),
       fleet: async () => this.fleetPanel(),
@@ -418,34 +426,6 @@ class Page {
     );
   }
 
-  private async changesPanel(): Promise<void> {
-    const told = await ask<{ changes: Change[]; alone: number; left_out: number }>("changes");
-    const holder = byId("changes");
-    if (holder.contains(document.activeElement) && holder.querySelector(".items")) return;
-    this.showChanges(told);
-  }
-
-  private showChanges(told: { changes: Change[]; alone: number; left_out: number }): void {
-    const holder = byId("changes");
-    if (!told.changes.length) {
-      holder.replaceChildren(make("p", { class: "empty" }, "Nothing has changed since the survey."));
-      return;
-    }
-    const chosen = told.changes.filter((one) => this.changeFilter === "all" || one.change === this.changeFilter);
-    const filters = make("div", { class: "choices filters", role: "radiogroup", "aria-label": "Which changes" });
-    for (const [key, word] of [["all", "All"], ["new", "New"], ["gone", "Gone"], ["changed", "Changed"]]) {
-      const n = key === "all" ? told.changes.length : told.changes.filter((one) => one.change === key).length;
-      const button = make("button", { type: "button", role: "radio", "aria-checked": String(this.changeFilter === key) }, `${word} ${n}`);
-      button.addEventListener("click", () => {
-        this.changeFilter = key;
-        this.showChanges(told);
-      });
-      filters.append(button);
-    }
-    const rest = [told.alone ? `${many(told.alone, "single voxel")} besides` : "", told.left_out ? `${told.left_out} smaller ones not listed` : ""].filter(Boolean);
-    holder.replaceChildren(filters, changeItems(chosen, (one) => this.goTo(one)), make("p", { class: "empty" }, rest.join("; ")));
-  }
-
   private goTo(one: Change): void {
     const [x, y, z] = one.at_m;
     this.view.fly(new THREE.Vector3(x, y, z + one.tall_m / 2), Math.max(18, 2.2 * Math.max(one.length_m, one.tall_m)));
@@ -461,6 +441,7 @@ class Page {
         ["Layer", about.layer],
         ["Origin", `${about.origin_deg[0].toFixed(5)}°, ${about.origin_deg[1].toFixed(5)}°`],
         ["First version", about.first_ms ? when(about.first_ms) : "–"],
+        ["You", `${about.viewer}, ${about.may_decide ? "may decide about changes" : "looks only"}`],
       ]),
     );
   }
@@ -531,6 +512,7 @@ class Page {
     this.view.background(THEMES[theme].map);
     this.overview.tint(new THREE.Color(THEMES[theme].map));
     this.timeline.marks(this.tiles.times());
+    this.work.repaint();
   }
 
   private side(isOpen: boolean): void {
@@ -558,7 +540,7 @@ class Page {
 
   private key(event: KeyboardEvent): void {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const isTyping = (event.target as HTMLElement).closest("input, select, button, [role=tab]");
+    const isTyping = (event.target as HTMLElement).closest("input, select, textarea, button, dialog, [role=tab]");
     if (event.key === "Escape") this.unselect();
     if (isTyping) return;
     if (event.key.toLowerCase() === "b") this.compare(this.view.split === null);

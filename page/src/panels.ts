@@ -1,12 +1,10 @@
 // What stands beside the map, as elements. Every word from the server is set as text.
 
-import type { Change, Story, Vehicle } from "./api";
+import type { Story, Vehicle } from "./api";
 import { palette } from "./colours";
 import { bytes, facts, make, many, span, swatch, when } from "./dom";
 
-const CHANGE_COLOURS: Record<string, string> = { new: palette.change.new, gone: palette.change.removed, changed: palette.change.changed };
 const WHAT: Record<string, string> = { surveyed: "surveyed", new: "new", changed: "changed", removed: "removed", empty: "nothing here" };
-const CHANGE_WORDS: Record<string, string> = { new: "New", gone: "Gone", changed: "Changed" };
 
 export function voxelPanel(story: Story): Node[] {
   const g = story.gaussian;
@@ -50,23 +48,6 @@ function raysOf(rays: Record<string, number>): string {
   return Object.entries(rays)
     .map(([name, n]) => `${n} ${name.replaceAll("_", " ")}`)
     .join(", ");
-}
-
-export function changeItems(changes: Change[], go: (one: Change) => void): HTMLElement {
-  const list = make("ul", { class: "items" });
-  for (const one of changes) {
-    const size = `${one.length_m.toFixed(1)} × ${one.width_m.toFixed(1)} × ${one.tall_m.toFixed(1)} m`;
-    const who = one.vehicles === null ? "from a survey" : `${many(one.vehicles, "vehicle")}, ${many(one.reports, "report")}`;
-    const button = make(
-      "button",
-      { type: "button", class: "item" },
-      make("span", { class: "head" }, swatch(CHANGE_COLOURS[one.change]), `${CHANGE_WORDS[one.change] ?? one.change} ${one.shape}`),
-      make("span", { class: "soft num" }, `${size}, ${many(one.voxels, "voxel")}; ${who}`),
-    );
-    button.addEventListener("click", () => go(one));
-    list.append(make("li", {}, button));
-  }
-  return list;
 }
 
 export function fleetItems(vehicles: Vehicle[], go: (one: Vehicle) => void): HTMLElement {

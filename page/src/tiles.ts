@@ -5,6 +5,7 @@ import { ask, askBytes, type About, type TileInfo } from "./api";
 import { palette, rgb, type Shades } from "./colours";
 import { Drawable, type Looks, meets, meshOf, paint } from "./gaussians";
 import { missing, type Packed, renewed, subset, unpack } from "./packed";
+import { matrixOf } from "./pictures";
 
 const FINE_M = 320;
 const REACH_M = 1500;
@@ -40,8 +41,7 @@ class Tile {
 
   constructor(public info: TileInfo, looks: Looks, ground_m: number, groups: [THREE.Group, THREE.Group]) {
     const [x, y, z] = info.place;
-    const t = info.turn;
-    this.matrix = new THREE.Matrix4().set(t[0], t[1], t[2], x, t[3], t[4], t[5], y, t[6], t[7], t[8], z, 0, 0, 0, 1);
+    this.matrix = matrixOf(info);
     this.centre = new THREE.Vector3(x, y, z + ground_m);
     this.slots = groups.map((group) => {
       const mesh = meshOf(new THREE.BufferGeometry(), looks.disc);
@@ -280,7 +280,7 @@ export class Tiles {
     const name = `${tile.info.id}/${place}`;
     this.underway.add(name);
     try {
-      const packed = unpack(await askBytes(`tiles/${tile.info.id}/${version}.bin?level=${level}&map=${this.about.key}`));
+      const packed = unpack(await askBytes(this.address(tile.info, version, level)));
       const loaded = tile.loaded.get(place) ?? { packed, drawable: new Drawable(packed), painted: "" };
       tile.loaded.set(place, loaded);
       this.failed.delete(name);
@@ -291,6 +291,16 @@ export class Tiles {
     } finally {
       this.underway.delete(name);
     }
+  }
+
+  /** A version with every voxel; it is not kept here. */
+  async packedOf(info: TileInfo, version: number): Promise<Packed> {
+    const known = this.tiles.get(info.id)?.loaded.get(`${version}/0`);
+    return known?.packed ?? unpack(await askBytes(this.address(info, version, 0)));
+  }
+
+  private address(info: TileInfo, version: number, level: number): string {
+    return `tiles/${info.id}/${version}.bin?level=${level}&map=${this.about.key}`;
   }
 
   /** Memory is for what is near. */

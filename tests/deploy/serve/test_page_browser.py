@@ -2,8 +2,11 @@
 
 import io
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,19 @@ AXE = Path(__file__).parents[3] / "page" / "node_modules" / "axe-core" / "axe.mi
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 PATIENCE_S = 120.0
 """For a machine on which others work; how fast the page is, `python -m studies serve` measures."""
+
+ORANGE = (239, 156, 29)
+FORGERY = """<!doctype html><iframe name=hidden></iframe>
+<form action="TARGET" method=post enctype="text/plain" target=hidden>
+<input name='{"judgement": "roll_back", "why": "' value='"}'></form>
+<script>
+const body = JSON.stringify({judgement: "roll_back", why: "forged"});
+const send = how => fetch("TARGET", {method: "POST", body, credentials: "include", ...how}).catch(() => 0);
+document.forms[0].submit();
+Promise.all([send({mode: "no-cors"}), send({mode: "cors", headers: {"content-type": "application/json"}})])
+  .then(() => document.body.append(Object.assign(document.createElement("p"), {id: "tried"})));
+</script>"""
+"""What another site's page may try: a form, a request without asking first, and one that has to ask."""
 
 pytestmark = [
     pytest.mark.slow,
@@ -98,6 +114,26 @@ def page(street: LiveStreet) -> Iterator[ServedPage]:
         yield opened
 
 
+@contextmanager
+def elsewhere(page: str) -> Iterator[str]:
+    """Another site on this machine, with a page of its own."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("content-type", "text/html")
+            self.end_headers()
+            self.wfile.write(page.encode())
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
 def near(pixels: np.ndarray, colour: tuple[int, int, int], within: float = 0.12) -> int:
     """How many pixels have a hue, whatever the light on them."""
     length = np.linalg.norm(pixels, axis=2) + 1e-9
@@ -115,13 +151,13 @@ def test_it_draws_the_map_follows_it_and_stays_over_a_lost_router(
     )
     before = window.pixels()
     assert near(before, (174, 181, 186)) > 0.02 * before[:, :, 0].size, "the ground is grey"
-    assert near(before, (239, 156, 29)) == 0, "nothing is new"
+    assert near(before, ORANGE) == 0, "nothing is new"
 
     street.merge(street_tile(EAST, wall=True))
     window.until(lambda state: any(one["drawn_ms"] for one in state["updates"]), "an update is drawn")
     window.tab.wait_for_timeout(3500)  # the flash is over
     window.drawn()
-    assert near(window.pixels(), (239, 156, 29)) > 200, "the new wall is orange"
+    assert near(window.pixels(), ORANGE) > 200, "the new wall is orange"
 
     street.stop_router()
     street.start_router()
@@ -212,6 +248,61 @@ def test_the_work_list_flies_to_a_change(
     for tab in ("fleet", "traffic", "cloud", "view"):
         window.tab.click(f"#tab-{tab}")
     assert window.complaints == []
+
+
+def shots_of(window: Window, what: str) -> list[np.ndarray]:
+    """(H, W, 3) the pictures before and after of a change of the list."""
+    card = window.tab.locator("#changes .card", has_text=what).first
+    card.locator("canvas[data-drawn]").nth(1).wait_for(timeout=60_000)
+    found = card.locator("canvas").evaluate_all(
+        "all => all.map(c => [c.width, ...c.getContext('2d').getImageData(0, 0, c.width, c.height).data])"
+    )
+    return [np.array(one[1:]).reshape(-1, one[0], 4)[:, :, :3] for one in found]
+
+
+def test_changes_are_decided_from_the_work_list_with_pictures(
+    open_page: Callable[..., Window], street: LiveStreet
+) -> None:
+    street.merge(street_tile(EAST, wall=True), quietly=True)
+    street.merge(street_tile(HERE, wall=False), quietly=True)
+    hostile = '<img src=x onerror="window.hacked=1">'
+    with served(street.path, "--allow-changes") as page:
+        window = open_page(page.url)
+        with_wall = window.drawn()["gaussians"]
+        window.tab.click("#tab-changes")
+        before, after = shots_of(window, "New wall")
+        assert (near(before, ORANGE), near(after, ORANGE) > 500) == (0, True), "the wall is in the second picture alone"
+        before, after = shots_of(window, "Gone wall")
+        assert np.abs(before - after).max() > 60
+
+        window.tab.get_by_role("button", name="Roll back: New wall").click()
+        assert window.tab.locator("#decideok").is_disabled(), "a reason is wanted"
+        window.tab.fill("#decidewhy", hostile)
+        window.tab.click("#decideok")
+        window.tab.locator("#changes .record", has_text=hostile).wait_for(timeout=60_000)
+        assert window.tab.locator("#changes .card", has_text="New wall").count() == 0
+        assert window.tab.evaluate("[document.querySelectorAll('#changes img').length, window.hacked]") == [0, None]
+        window.until(lambda state: state["gaussians"] == with_wall - 120, "the map follows")
+        assert street.store.history("ndt", EAST)[-1].kind == "rollback"
+
+        window.tab.get_by_role("button", name="Accept: Gone wall").focus()
+        window.tab.keyboard.press("Enter")
+        window.tab.keyboard.press("Tab")
+        window.tab.keyboard.press("Tab")
+        window.tab.keyboard.press("Enter")
+        window.tab.locator("[data-filter=accepted]", has_text="Accepted 1").wait_for(timeout=60_000)
+        assert window.tab.locator("[data-filter=open]").inner_text() == "Open 0"
+        assert window.complaints == []
+
+        before_forgery = [one.version for one in street.store.head_lines("ndt")]
+        key = page.value("/api/changes")["changes"][0]["key"]
+        with elsewhere(FORGERY.replace("TARGET", f"http://127.0.0.1:{page.port}/api/changes/{key}")) as url:
+            evil = window.context.new_page()  # with the page's cookie in the same browser
+            evil.goto(url)
+            evil.locator("#tried").wait_for(state="attached", timeout=60_000)
+            evil.wait_for_timeout(500)
+        assert [one.version for one in street.store.head_lines("ndt")] == before_forgery
+        assert len(page.value("/api/changes")["decided"]) == 2
 
 
 def test_names_are_shown_as_they_are_and_never_run(
