@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import os
 import shutil
 import statistics
 import tempfile
@@ -17,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.deploy.chaos.street import read_street
+from gnd.deploy.load.cpu import children, cpu_s
 from gnd.deploy.serve.app import PAGE
 from gnd.deploy.serve.command import PageSource, serve_page
 from gnd.deploy.serve.guard import PageAddress
@@ -35,6 +37,12 @@ from studies.frame.options import check, option
 
 SOFTWARE_GL: Final = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
 WINDOW: Final = {"width": 1280, "height": 800}
+AS_DRAWN: Final = "{}"
+ELLIPSOIDS: Final = "{near_m: 1e6, disc_m: 1e6, fine_m: 1e6}"
+SINGLY: Final = "{fine_m: 1e6}"
+"""What the page draws how (m, see `Tiles` in page/src): as it does by itself, all as ellipsoids, nothing merged."""
+STREET_M: Final = 40.0
+"""From so far somebody looks at a place in a street."""
 _PATIENCE_S: Final = 600.0
 _BATCH: Final = 2_000
 
@@ -44,6 +52,8 @@ class PageOptions:
     """How much is shown, and how long it is looked at."""
 
     gaussians: int = option(50_000, "Ellipsoids in view.", span=(1_000, 1_000_000))
+    crowd: int = option(250_000, "Gaussians of a larger map; 0: none.", span=(0, 2_000_000))
+    most: int = option(1_000_000, "Gaussians of the largest map; 0: none.", span=(0, 2_000_000))
     tiles: int = option(100_000, "Tiles of the city; 0: no city.", span=(0, 1_000_000))
     updates: int = option(40, "Versions published while the page looks on.", span=(1, 10_000))
     seconds: float = option(5.0, "So long frames are counted.", span=(0.5, 600))
@@ -59,8 +69,11 @@ def run(options: PageOptions | None = None) -> list[Figure]:
     """Measure in Chromium."""
     options = options or PageOptions()
     with tempfile.TemporaryDirectory() as name, _browser() as browser:
-        found = [_size(), *_street(browser, Path(name), options)]
-        return [*found, *_city(browser, Path(name), options)] if options.tiles else found
+        folder = Path(name)
+        found = [_size(), *_street(browser, folder, options)]
+        for n in (options.crowd, options.most):
+            found += _crowd(browser, folder, n, options.seconds) if n else []
+        return [*found, *_city(browser, folder, options)] if options.tiles else found
 
 
 def _size() -> Figure:
@@ -135,6 +148,7 @@ def _street(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
         ]
         if complaints:
             raise BrowserError(f"the page complains {len(complaints)} times, first: {complaints[0]}")
+        tab.close()
         return found
 
 
@@ -147,14 +161,58 @@ def _window(browser: Any) -> tuple[Any, list[str]]:
 
 
 def _frames(tab: Any, shown: int, seconds: float) -> list[Figure]:
-    """Frames a second: all as ellipsoids, all as discs, and near and far as the page draws them."""
-    told = f"{WINDOW['width']} x {WINDOW['height']}, {shown} Gaussians"
-    usual_m = float(tab.evaluate("gndPage.tiles.near_m"))
-    kinds = (("all as ellipsoids", 1e6), ("near as ellipsoids, far as discs", usual_m), ("all as discs", 0.0))
-    found = []
-    for name, near_m in kinds:
-        rate = float(tab.evaluate(f"gndPage.rate({seconds}, {near_m})"))
-        found.append(Figure(f"frames, {name}", rate, "1/s", told))
+    """Frames a second: all as ellipsoids, and as the page draws them."""
+    return [
+        _rate(tab, f"frames, {shown} Gaussians, {name}", reach, seconds)
+        for name, reach in (("all as ellipsoids", ELLIPSOIDS), ("as the page draws them", AS_DRAWN))
+    ]
+
+
+def _rate(tab: Any, name: str, reach: str, seconds: float) -> Figure:
+    """Frames a second and, which says more where others work on the machine, the browser's CPU time for each."""
+    tab.evaluate(f"gndPage.rate(0.01, {reach})")  # loads what is to be seen
+    before_s = _browser_s()
+    rate = float(tab.evaluate(f"gndPage.rate({seconds}, {reach})"))
+    each_ms = 1000 * (_browser_s() - before_s) / max(rate * seconds, 1.0)
+    drawn = tab.evaluate("gndPage.rated")
+    told = f"{each_ms:.0f} ms of CPU a frame; {drawn['gaussians']} drawn, of {drawn['tiles']} tiles"
+    return Figure(name, rate, "1/s", told)
+
+
+def _browser_s() -> float:
+    return sum(cpu_s(child) for child in children(os.getpid()))
+
+
+def _crowd(browser: Any, folder: Path, n: int, seconds: float) -> list[Figure]:
+    """First picture and frames of a map of so many Gaussians: as a whole, and from a street in its middle."""
+    some = max(read_street().tiles, key=lambda one: len(one.gaussians))
+    path = folder / f"{n}.sqlite"
+    with SqliteStore(path) as store:
+        store.put_tiles(list(_row(some, -(-n // len(some.gaussians)))))
+    with _served(PageSource(path)) as url:
+        tab, complaints = _window(browser)
+        begin_s = time.monotonic()
+        tab.goto(url)
+        _until(tab, "gndPage.firstPicture_ms > 0")
+        picture_s = time.monotonic() - begin_s
+        _until(tab, "!gndPage.state.isLoading")
+        loaded_s = time.monotonic() - begin_s
+        found = [
+            Figure(f"first picture, {n} Gaussians", picture_s, "s"),
+            Figure(f"all in view is loaded, {n} Gaussians", loaded_s, "s"),
+            _rate(tab, f"frames, {n} Gaussians, the whole map", AS_DRAWN, seconds),
+            _rate(tab, f"frames, {n} Gaussians, the whole map, each drawn singly", SINGLY, seconds),
+        ]
+        x, y, z = tab.evaluate("gndPage.view.controls.target.toArray()")
+        eye = f"{x - 0.8 * STREET_M}, {y - 0.5 * STREET_M}, {z + 0.33 * STREET_M}"
+        tab.evaluate(f"gndPage.view.place(new gndPage.Place({x}, {y}, {z}), new gndPage.Place({eye}))")
+        found += [
+            _rate(tab, f"frames, {n} Gaussians, from a street", AS_DRAWN, seconds),
+            _rate(tab, f"frames, {n} Gaussians, from a street, each drawn singly", SINGLY, seconds),
+        ]
+        tab.close()
+    if complaints:
+        raise BrowserError(f"the page complains {len(complaints)} times, first: {complaints[0]}")
     return found
 
 

@@ -3,7 +3,7 @@
     0   4 bytes   "GND1"
     4   u32       N, the number of Gaussians
     8   u32       version of the tile
-    12  u32       level of detail: 0 every voxel, 1 blocks of 4 x 4 x 4 voxels
+    12  u32       level of detail: 0 every voxel, 1 blocks of 2 x 2 x 2 voxels, 2 of 4 x 4 x 4
     16  f32[3N]   means, m, in the tile's frame (ENU at its centre on the ellipsoid)
         i32[N]    voxel ids; of a block the first of its voxels
         u32[N]    when the voxel became what it is, POSIX seconds; 0 = not known
@@ -27,16 +27,16 @@ from gnd.gnd_map.grid import VoxelGrid
 
 MAGIC: Final = b"GND1"
 HEAD: Final = struct.Struct("<4sIII")
-LEVELS: Final = 2
-BLOCK: Final = 4
-"""Voxels along each side of a block of level 1."""
+BLOCKS: Final = (1, 2, 4)
+"""Voxels along each side of a block, by level."""
+LEVELS: Final = len(BLOCKS)
 METRES_PER_STEP: Final = 1e-4
 _FULL: Final = 65_535
 
 
 def packed(state: PageTile, level: int) -> bytes:
     """The bytes of a version at a level of detail."""
-    columns = _voxels(state) if level == 0 else _blocks(state)
+    columns = _voxels(state) if level == 0 else _blocks(state, BLOCKS[level])
     voxel_id, mean_m, cov_m2, count, since_s, reports, cells, kind = columns
     turn, sd_m = axes_of(cov_m2)
     shape = np.empty((len(voxel_id), 4), "<u2")
@@ -66,13 +66,13 @@ def _voxels(state: PageTile) -> _Columns:
     return (g.voxel_id, mean_m, g.full_cov(), *told)  # type: ignore[return-value]  # a generator of four
 
 
-def _blocks(state: PageTile) -> _Columns:
+def _blocks(state: PageTile, side: int) -> _Columns:
     """Blocks of voxels as one Gaussian each: moments add. Of when, by whom and what the latest counts."""
     voxel_id, mean_m, cov_m2, count, since_s, reports, cells, kind = _voxels(state)
     if not len(voxel_id):
         return voxel_id, mean_m, cov_m2, count, since_s, reports, cells, kind
     ix, iy, floor = VoxelGrid.of(state.tile).unravel(voxel_id)
-    block = (floor // BLOCK * 1024 + iy // BLOCK) * 1024 + ix // BLOCK
+    block = (floor // side * 1024 + iy // side) * 1024 + ix // side
     _, first, inverse = np.unique(block, return_index=True, return_inverse=True)
     n = len(first)
     points = np.zeros(n, np.int64)

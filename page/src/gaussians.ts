@@ -1,6 +1,7 @@
-// Gaussians on the GPU: a triangle each. Far ones are discs along their two longest axes, whose corners are computed once;
-// near ones are ellipsoids, which the fragment shader meets with the ray of its pixel, and whose corners read their
-// Gaussian from a texture. (Instances would say the same, but software GL draws each by itself, many times slower.)
+// Gaussians on the GPU. Near ones are ellipsoids, a triangle each, which the fragment shader meets with the ray of its
+// pixel, and whose corners read their Gaussian from a texture. Farther ones are discs along their two longest axes, a
+// triangle each, whose corners are computed once. Far ones are round discs of the same area, a point each: a third of the
+// corners. (Instances would say the same, but software GL draws each by itself, many times slower.)
 
 import * as THREE from "three";
 import { colourOf, type Shades } from "./colours";
@@ -87,6 +88,36 @@ const DISC_FRAGMENT = /* glsl */ `
   }
 `;
 
+const POINT_VERTEX = /* glsl */ `
+  in vec4 aNormal; in vec4 aColour; in float aReach;
+  uniform float uTime; uniform float uFlashAt; uniform vec3 uFlash; uniform float uFocal;
+  flat out vec3 vAcross; flat out vec3 vColour;
+  ${LIGHT}
+  void main() {
+    vec4 at = modelViewMatrix * vec4(position, 1.0);
+    vec3 n = mat3(modelViewMatrix) * aNormal.xyz;
+    float slant = dot(n, normalize(at.xyz)), r = 1.12 * uFocal * aReach / -at.z; // no seams
+    float glow = aColour.a > 0.5 ? clamp(1.0 - (uTime - uFlashAt) / ${FLASH_S.toFixed(1)}, 0.0, 1.0) : 0.0;
+    vColour = shaded(mix(aColour.rgb, uFlash, glow * 0.85), slant > 0.0 ? -n : n);
+    // Along the normal, as it lies on the screen, the disc is as much shorter as one looks at it askance.
+    float flat2 = length(n.xy);
+    vAcross = r < 1.2 || flat2 < 0.01 ? vec3(0.0) : vec3(n.xy / flat2, 1.0 / clamp(abs(slant), 0.8 / r, 1.0));
+    gl_PointSize = clamp(2.0 * r, 1.5, 60.0);
+    gl_Position = projectionMatrix * at;
+  }
+`;
+
+const POINT_FRAGMENT = /* glsl */ `
+  flat in vec3 vAcross; flat in vec3 vColour;
+  out vec4 pixel;
+  void main() {
+    vec2 p = vec2(2.0, -2.0) * (gl_PointCoord - 0.5);
+    float a = dot(p, vAcross.xy) * vAcross.z, b = dot(p, vec2(-vAcross.y, vAcross.x));
+    if (a * a + b * b > 1.0) discard;
+    pixel = vec4(vColour, 1.0);
+  }
+`;
+
 const ELLIPSOID_VERTEX = /* glsl */ `
   ${COMMON}
   flat out float vDepth; out vec3 vRay; flat out vec3 vEye; flat out vec3 vColour; flat out mat3 vBack;
@@ -133,14 +164,16 @@ const ELLIPSOID_FRAGMENT = /* glsl */ `
 `;
 
 export interface Looks {
+  point: THREE.ShaderMaterial;
   disc: THREE.ShaderMaterial;
   ellipsoid: THREE.ShaderMaterial;
   ghost: THREE.ShaderMaterial;
-  uniforms: { uTime: { value: number }; uFlash: { value: THREE.Color } };
+  /** `uFocal`: pixels that 1 m is high at a distance of 1 m. */
+  uniforms: { uTime: { value: number }; uFlash: { value: THREE.Color }; uFocal: { value: number } };
 }
 
 export function looks(): Looks {
-  const uniforms = { uTime: { value: 0 }, uFlash: { value: new THREE.Color(1, 1, 1) } };
+  const uniforms = { uTime: { value: 0 }, uFlash: { value: new THREE.Color(1, 1, 1) }, uFocal: { value: 800 } };
   const make = (vertexShader: string, fragmentShader: string, ghost: number) =>
     new THREE.ShaderMaterial({
       glslVersion: THREE.GLSL3,
@@ -150,6 +183,7 @@ export function looks(): Looks {
       side: THREE.DoubleSide,
     });
   return {
+    point: make(POINT_VERTEX, POINT_FRAGMENT, 0),
     disc: make(DISC_VERTEX, DISC_FRAGMENT, 0),
     ellipsoid: make(ELLIPSOID_VERTEX, ELLIPSOID_FRAGMENT, 0),
     ghost: make(DISC_VERTEX, DISC_FRAGMENT, 1),
@@ -161,36 +195,50 @@ const [WEST, EAST] = [-Math.sqrt(3), Math.sqrt(3)];
 const CORNERS = [WEST, -1, EAST, -1, 0, 2];
 const FLASHES = 255;
 
-/** A version as the GPU has it. */
+type Kind = "points" | "discs" | "ellipsoids";
+
+/** A version as the GPU has it, in each kind of drawing from when it is first needed. */
 export class Drawable {
-  readonly discs = new THREE.BufferGeometry();
   flashAt = 0;
-  private readonly colours: Uint8Array;
+  private readonly colours: Uint8Array<ArrayBuffer>;
+  private readonly made: Partial<Record<Kind, THREE.BufferGeometry>> = {};
+  private corners: Uint8Array | null = null;
   private texture: THREE.DataTexture | null = null;
   private words = new Uint32Array(0);
-  private near: THREE.BufferGeometry | null = null;
 
   constructor(private readonly p: Packed) {
-    const [at, normals] = discsOf(p);
-    this.colours = new Uint8Array(12 * p.n);
-    this.discs.setAttribute("position", new THREE.BufferAttribute(at, 3));
-    this.discs.setAttribute("aNormal", new THREE.BufferAttribute(normals, 4, true));
-    this.discs.setAttribute("aColour", new THREE.BufferAttribute(this.colours, 4, true));
-    this.bound(this.discs);
+    this.colours = new Uint8Array(4 * p.n);
   }
 
-  /** For the ellipsoids: made when they are near for the first time. */
+  get points(): THREE.BufferGeometry {
+    return (this.made.points ??= this.bound((geometry) => {
+      const [normals, reach] = pointsOf(this.p);
+      geometry.setAttribute("position", new THREE.BufferAttribute(this.p.mean, 3));
+      geometry.setAttribute("aNormal", new THREE.BufferAttribute(normals, 4, true));
+      geometry.setAttribute("aReach", new THREE.BufferAttribute(reach, 1));
+      geometry.setAttribute("aColour", new THREE.BufferAttribute(this.colours, 4, true));
+    }));
+  }
+
+  get discs(): THREE.BufferGeometry {
+    return (this.made.discs ??= this.bound((geometry) => {
+      const [at, normals] = discsOf(this.p);
+      this.corners = new Uint8Array(12 * this.p.n);
+      geometry.setAttribute("position", new THREE.BufferAttribute(at, 3));
+      geometry.setAttribute("aNormal", new THREE.BufferAttribute(normals, 4, true));
+      geometry.setAttribute("aColour", new THREE.BufferAttribute(this.corners, 4, true));
+      this.toCorners();
+    }));
+  }
+
   get ellipsoids(): THREE.BufferGeometry {
-    if (!this.near) {
+    return (this.made.ellipsoids ??= this.bound((geometry) => {
       this.words = wordsOf(this.p);
       this.texture = new THREE.DataTexture(this.words, ROW, this.words.length / (4 * ROW), THREE.RGBAIntegerFormat, THREE.UnsignedIntType);
       this.texture.internalFormat = "RGBA32UI";
-      this.near = new THREE.BufferGeometry();
-      this.near.setDrawRange(0, 3 * this.p.n);
-      this.bound(this.near);
+      geometry.setDrawRange(0, 3 * this.p.n);
       this.toTexture();
-    }
-    return this.near;
+    }));
   }
 
   /** Gives the uniforms of a material what this version has of its own. */
@@ -202,45 +250,66 @@ export class Drawable {
   paint(colour: (row: number) => [number, number, number]): void {
     for (let i = 0; i < this.p.n; i++) {
       const [r, g, b] = colour(i);
-      for (let c = 0; c < 3; c++) {
-        this.colours[12 * i + 4 * c] = r;
-        this.colours[12 * i + 4 * c + 1] = g;
-        this.colours[12 * i + 4 * c + 2] = b;
-      }
+      this.colours[4 * i] = r;
+      this.colours[4 * i + 1] = g;
+      this.colours[4 * i + 2] = b;
     }
     this.toGpu();
   }
 
   /** Lets some rows flash from now on. */
   flash(rows: number[], now_s: number): void {
-    for (const row of rows) for (let c = 0; c < 3; c++) this.colours[12 * row + 4 * c + 3] = FLASHES;
+    for (const row of rows) this.colours[4 * row + 3] = FLASHES;
     this.flashAt = now_s;
     this.toGpu();
   }
 
   dispose(): void {
-    this.discs.dispose();
-    this.near?.dispose();
+    for (const geometry of Object.values(this.made)) geometry.dispose();
     this.texture?.dispose();
   }
 
   private toGpu(): void {
-    this.discs.getAttribute("aColour").needsUpdate = true;
+    if (this.made.points) this.made.points.getAttribute("aColour").needsUpdate = true;
+    if (this.corners) this.toCorners();
     if (this.texture) this.toTexture();
+  }
+
+  private toCorners(): void {
+    const [from, into] = [new Uint32Array(this.colours.buffer), new Uint32Array(this.corners!.buffer)];
+    for (let i = 0; i < into.length; i++) into[i] = from[(i / 3) | 0];
+    if (this.made.discs) this.made.discs.getAttribute("aColour").needsUpdate = true;
   }
 
   private toTexture(): void {
     const colours = new Uint32Array(this.colours.buffer);
-    for (let i = 0; i < this.p.n; i++) this.words[8 * i + 3] = colours[3 * i];
+    for (let i = 0; i < this.p.n; i++) this.words[8 * i + 3] = colours[i];
     this.texture!.needsUpdate = true;
   }
 
-  private bound(geometry: THREE.BufferGeometry): void {
+  private bound(fill: (geometry: THREE.BufferGeometry) => void): THREE.BufferGeometry {
+    const geometry = new THREE.BufferGeometry();
     const { n, low, high } = this.p;
     const middle = new THREE.Vector3(0, 0, n ? (low + high) / 2 : 0);
     geometry.boundingSphere = new THREE.Sphere(middle, 30 + (n ? (high - low) / 2 : 0));
     geometry.userData.drawable = this;
+    fill(geometry);
+    return geometry;
   }
+}
+
+/** The normal of each disc, and the radius, m, of the round one that is as large. */
+function pointsOf(p: Packed): [Int8Array, Float32Array] {
+  const normals = new Int8Array(4 * p.n);
+  const reach = new Float32Array(p.n);
+  for (let i = 0; i < p.n; i++) {
+    const [x, y, z, w] = [p.turn[4 * i] / 32767, p.turn[4 * i + 1] / 32767, p.turn[4 * i + 2] / 32767, p.turn[4 * i + 3] / 32767];
+    const third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
+    for (let k = 0; k < 3; k++) normals[4 * i + k] = Math.round(127 * third[k]);
+    const [a, b] = [0, 1].map((k) => Math.max(p.shape[4 * i + k] * METRES_PER_STEP * SIGMAS, 0.05));
+    reach[i] = Math.sqrt(a * b);
+  }
+  return [normals, reach];
 }
 
 /** The corners of a triangle around each disc, and its normal at each of them. */
@@ -280,7 +349,15 @@ function wordsOf(p: Packed): Uint32Array<ArrayBuffer> {
 
 /** A mesh whose material is lent what its geometry has of its own. */
 export function meshOf(geometry: THREE.BufferGeometry, material: THREE.Material): THREE.Mesh {
-  const mesh = new THREE.Mesh(geometry, material);
+  return lent(new THREE.Mesh(geometry, material));
+}
+
+/** The same of points. */
+export function pointsMesh(material: THREE.Material): THREE.Points {
+  return lent(new THREE.Points(new THREE.BufferGeometry(), material));
+}
+
+function lent<T extends THREE.Mesh | THREE.Points>(mesh: T): T {
   mesh.matrixAutoUpdate = false;
   mesh.onBeforeRender = (_renderer, _scene, _camera, of, used) => {
     const look = used as THREE.ShaderMaterial;

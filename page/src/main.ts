@@ -43,6 +43,9 @@ class Page {
   /** For measurements: when the last update was published, heard and drawn, POSIX ms. */
   readonly updates: { version: number; tile: number; created_ms: number; heard_ms: number; drawn_ms: number }[] = [];
   readonly began_ms = performance.now();
+  readonly Place = THREE.Vector3;
+  /** What `rate` has drawn in each frame. */
+  rated = { tiles: 0, gaussians: 0 };
   firstPicture_ms = 0;
 
   constructor(private readonly about: About) {
@@ -158,6 +161,7 @@ class Page {
 
   private onFrame(now_s: number): void {
     this.looks.uniforms.uTime.value = now_s;
+    this.looks.uniforms.uFocal.value = this.view.focal_px;
     if (this.timeline.advance()) this.view.keepDrawing(0.5);
     const { camera, controls } = this.view;
     const reach = Math.max(150, 1.6 * camera.position.distanceTo(controls.target));
@@ -512,7 +516,6 @@ class Page {
     this.view.background(THEMES[theme].map);
     this.overview.tint(new THREE.Color(THEMES[theme].map));
     this.timeline.marks(this.tiles.times());
-    this.work.repaint();
   }
 
   private side(isOpen: boolean): void {
@@ -615,25 +618,29 @@ class Page {
     return { ...drawn, isLoading: this.tiles.isLoading, quality: this.tiles.quality, firstPicture_ms: this.firstPicture_ms, updates: this.updates, selected: this.selected, live: this.isLive, open: this.isOpen, split: this.view.split, time_ms: this.timeline.after_ms, vehicles: [...this.vehicles.known.keys()] };
   }
 
-  async rate(seconds: number, near_m: number): Promise<number> {
-    const [quality, usual_m] = [this.tiles.quality, this.tiles.near_m];
+  /** Frames a second when every frame is drawn as these distances say (m, see `Tiles`). */
+  async rate(seconds: number, reach: Partial<Pick<Tiles, "near_m" | "disc_m" | "fine_m" | "block_m">> = {}): Promise<number> {
+    const { near_m, disc_m, fine_m, block_m, quality } = this.tiles;
     const gl = this.view.renderer.getContext();
     const pixel = new Uint8Array(4);
-    this.tiles.near_m = near_m;
-    this.rearrange();
     this.view.isPaused = true;
-    const begin = performance.now();
-    let n = 0;
-    while (performance.now() - begin < 1000 * seconds) {
-      this.tiles.quality = 1;
+    const frame = async (isAnew = false) => {
+      Object.assign(this.tiles, reach, { quality: 1 });
+      if (isAnew) this.arranged = 0;
       this.view.draw();
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // until it is really drawn
-      n++;
       await new Promise((resolve) => setTimeout(resolve, 0));
-    }
+    };
+    do await frame(true);
+    while (this.tiles.isLoading);
+    const begin = performance.now();
+    let n = 0;
+    for (; performance.now() - begin < 1000 * seconds; n++) await frame();
+    const rate = (1000 * n) / (performance.now() - begin);
+    this.rated = { ...this.tiles.drawn };
+    Object.assign(this.tiles, { near_m, disc_m, fine_m, block_m, quality });
     this.view.isPaused = false;
-    [this.tiles.quality, this.tiles.near_m] = [quality, usual_m];
-    return (1000 * n) / (performance.now() - begin);
+    return rate;
   }
 }
 

@@ -37,11 +37,6 @@ export class Pictures {
     this.camera.up.set(0, 0, 1);
   }
 
-  /** The colours of the page are others now. */
-  forget(): void {
-    this.kept.clear();
-  }
-
   /** Draws a change into two canvases, after those that were asked for before. */
   show(one: Change, before: HTMLCanvasElement, after: HTMLCanvasElement): Promise<unknown> {
     this.queue = this.queue.then(() => this.into(one, before, after)).catch((error) => {
@@ -98,14 +93,16 @@ export class Pictures {
   private rendered(scene: THREE.Scene): ImageData {
     const [width, height] = [WIDE * SCALE, HIGH * SCALE];
     const from = new Uint8Array(4 * width * height);
+    const alpha = this.renderer.getClearAlpha();
+    this.renderer.setClearAlpha(0); // what lies behind is the canvas's own colour
     this.renderer.setRenderTarget(this.target);
     this.renderer.clear();
     this.renderer.render(scene, this.camera);
     this.renderer.readRenderTargetPixels(this.target, 0, 0, width, height, from);
     this.renderer.setRenderTarget(null);
+    this.renderer.setClearAlpha(alpha);
     const picture = new ImageData(width, height);
     for (let y = 0; y < height; y++) picture.data.set(from.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
-    for (let i = 3; i < picture.data.length; i += 4) picture.data[i] = 255;
     return picture;
   }
 }

@@ -3,11 +3,10 @@
 import * as THREE from "three";
 import { ask, askBytes, type About, type TileInfo } from "./api";
 import { palette, rgb, type Shades } from "./colours";
-import { Drawable, type Looks, meets, meshOf, paint } from "./gaussians";
+import { Drawable, type Looks, meets, meshOf, paint, pointsMesh } from "./gaussians";
 import { missing, type Packed, renewed, subset, unpack } from "./packed";
 import { matrixOf } from "./pictures";
 
-const FINE_M = 320;
 const REACH_M = 1500;
 const AT_ONCE = 8;
 const MOST_GAUSSIANS = 2_500_000;
@@ -25,9 +24,15 @@ export interface Side {
   group: THREE.Group;
 }
 
+/** What shows one side of a tile: triangles where it is near, points where it is far. */
 interface Slot {
   mesh: THREE.Mesh;
+  points: THREE.Points;
   loaded: Loaded | null;
+}
+
+function hide(slot: Slot): void {
+  slot.mesh.visible = slot.points.visible = false;
 }
 
 class Tile {
@@ -44,11 +49,13 @@ class Tile {
     this.matrix = matrixOf(info);
     this.centre = new THREE.Vector3(x, y, z + ground_m);
     this.slots = groups.map((group) => {
-      const mesh = meshOf(new THREE.BufferGeometry(), looks.disc);
-      mesh.matrix.copy(this.matrix);
-      mesh.visible = false;
-      group.add(mesh);
-      return { mesh, loaded: null };
+      const slot: Slot = { mesh: meshOf(new THREE.BufferGeometry(), looks.disc), points: pointsMesh(looks.point), loaded: null };
+      for (const one of [slot.mesh, slot.points]) {
+        one.matrix.copy(this.matrix);
+        group.add(one);
+      }
+      hide(slot);
+      return slot;
     }) as unknown as [Slot, Slot];
   }
 
@@ -76,8 +83,14 @@ export class Tiles {
   showGhosts = true;
   /** Below 1 less is drawn finely. */
   quality = 1;
-  /** What is nearer is drawn as ellipsoids. */
+  /** What is nearer is drawn as ellipsoids, ... */
   near_m = 55;
+  /** ... as discs, a triangle each; what is farther as points. */
+  disc_m = 130;
+  /** What is nearer is drawn voxel by voxel, ... */
+  fine_m = 220;
+  /** ... in blocks of 2 x 2 x 2 voxels; what is farther of 4 x 4 x 4. */
+  block_m = 420;
   drawn = { tiles: 0, gaussians: 0 };
   leftOut = 0;
   private wanted: { tile: Tile; version: number; level: number; far: number }[] = [];
@@ -171,7 +184,7 @@ export class Tiles {
       tile.far = Math.max(0, tile.centre.distanceTo(camera) - 20);
       this.arrangeSide(tile, 1, this.after);
       if (this.comparing) this.arrangeSide(tile, 0, this.before);
-      else tile.slots[0].mesh.visible = false;
+      else hide(tile.slots[0]);
       this.arrangeGhost(tile, now_s);
     }
     this.wanted.sort((a, b) => a.far - b.far);
@@ -182,18 +195,17 @@ export class Tiles {
   private arrangeSide(tile: Tile, index: 0 | 1, side: Side): void {
     const slot = tile.slots[index];
     const version = tile.versionAt(side.time_ms);
-    const level = tile.far > FINE_M * this.quality ? 1 : 0;
+    const level = tile.far < this.fine_m * this.quality ? 0 : tile.far < this.block_m * this.quality ? 1 : 2;
     if (!version || !tile.isListed) {
-      slot.mesh.visible = false;
+      hide(slot);
       slot.loaded = null;
       return;
     }
     const best = tile.loaded.get(`${version}/${level}`);
     if (!best) this.want(tile, version, level);
-    const found = best ?? tile.loaded.get(`${version}/0`) ?? tile.loaded.get(`${version}/1`) ?? slot.loaded;
-    slot.mesh.visible = found !== null;
+    const found = best ?? [0, 1, 2].map((other) => tile.loaded.get(`${version}/${other}`)).find(Boolean) ?? slot.loaded;
     slot.loaded = found;
-    if (!found) return;
+    if (!found) return hide(slot);
     this.show(tile, slot, found);
     if (index === 1) {
       this.drawn.tiles++;
@@ -202,9 +214,15 @@ export class Tiles {
   }
 
   private show(tile: Tile, slot: Slot, found: Loaded): void {
+    const isFar = tile.far >= this.disc_m * this.quality;
     const isNear = tile.far < this.near_m * this.quality && found.packed.level === 0;
-    slot.mesh.geometry = isNear ? found.drawable.ellipsoids : found.drawable.discs;
-    slot.mesh.material = isNear ? this.looks.ellipsoid : this.looks.disc;
+    slot.points.visible = isFar;
+    slot.mesh.visible = !isFar;
+    if (isFar) slot.points.geometry = found.drawable.points;
+    else {
+      slot.mesh.geometry = isNear ? found.drawable.ellipsoids : found.drawable.discs;
+      slot.mesh.material = isNear ? this.looks.ellipsoid : this.looks.disc;
+    }
     const { mode, low, high, from_s, now_s } = this.shades;
     const how = `${mode}/${low}/${high}/${from_s}/${mode === "age" ? Math.floor(now_s / 30) : 0}`;
     if (found.painted !== how) {
@@ -220,7 +238,7 @@ export class Tiles {
       this.dropGhost(tile);
     }
     const [a, b] = [tile.versionAt(this.before.time_ms), tile.versionAt(this.after.time_ms)];
-    const isWanted = this.showGhosts && this.shades.mode === "change" && a && b && a !== b && tile.isListed && tile.far < FINE_M * this.quality;
+    const isWanted = this.showGhosts && this.shades.mode === "change" && a && b && a !== b && tile.isListed && tile.far < this.fine_m * this.quality;
     const of = `${a}-${b}`;
     if (!isWanted || (tile.ghost && tile.ghost.of !== of)) this.dropGhost(tile);
     if (!isWanted || tile.ghost) return;
@@ -324,13 +342,14 @@ export class Tiles {
     let best: (Hit & { far: number }) | null = null;
     for (const tile of this.tiles.values()) {
       const slot = tile.slots[isBefore ? 0 : 1];
-      if (!slot.mesh.visible || !slot.loaded || slot.loaded.packed.level !== 0) continue;
+      const shown = slot.loaded && tile.loaded.get(`${slot.loaded.packed.version}/0`);
+      if (!shown || !(slot.mesh.visible || slot.points.visible)) continue;
       const back = tile.matrix.clone().invert();
       const from = ray.origin.clone().applyMatrix4(back);
       const along = ray.direction.clone().transformDirection(back);
-      const found = meets(slot.loaded.packed, from, along);
+      const found = meets(shown.packed, from, along);
       if (found && (best === null || found.far < best.far)) {
-        const p = slot.loaded.packed;
+        const p = shown.packed;
         const at = new THREE.Vector3().fromArray(p.mean, 3 * found.row).applyMatrix4(tile.matrix);
         best = { tile: tile.info, version: p.version, packed: p, row: found.row, at, far: found.far };
       }

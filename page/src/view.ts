@@ -57,6 +57,11 @@ export class View {
     return this.renderer.domElement;
   }
 
+  /** Pixels that 1 m is high at a distance of 1 m. */
+  get focal_px(): number {
+    return 0.5 * this.canvas.height * this.camera.projectionMatrix.elements[5];
+  }
+
   redraw(): void {
     this.isDirty = true;
   }

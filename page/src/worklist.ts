@@ -27,7 +27,6 @@ const JUDGEMENTS: Judgement[] = [
 ];
 
 export class WorkList {
-  private told: Told | null = null;
   private filter = "open";
   private readonly seen: IntersectionObserver;
   private readonly waiting = new Map<Element, () => void>();
@@ -64,14 +63,7 @@ export class WorkList {
     if (isForced || !isBusy) this.show(told);
   }
 
-  /** The pictures have other colours now. */
-  repaint(): void {
-    this.pictures.forget();
-    if (this.told && this.holder.childElementCount) this.show(this.told);
-  }
-
   private show(told: Told): void {
-    this.told = told;
     this.waiting.clear();
     this.seen.disconnect();
     const parts: Node[] = [];

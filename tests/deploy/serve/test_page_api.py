@@ -102,10 +102,11 @@ def test_each_voxel_says_since_when_and_on_whose_word_it_is_so(page: ServedPage,
     assert set(found["since"][~changed].tolist()) == {1_767_225_600}
 
 
-def test_merged_blocks_keep_points_and_spread(page: ServedPage) -> None:
+@pytest.mark.parametrize(("level", "fewer"), [(1, 3), (2, 8)])
+def test_merged_blocks_keep_points_and_spread(page: ServedPage, level: int, fewer: int) -> None:
     fine = columns_of(page.get(f"/api/tiles/{HERE.morton}/1.bin?level=0").body)
-    blocks = columns_of(page.get(f"/api/tiles/{HERE.morton}/1.bin?level=1").body)
-    assert 8 * len(blocks["voxel"]) < len(fine["voxel"])
+    blocks = columns_of(page.get(f"/api/tiles/{HERE.morton}/1.bin?level={level}").body)
+    assert fewer * len(blocks["voxel"]) < len(fine["voxel"])
     weights = [one["shape"][:, 3].astype(float) for one in (fine, blocks)]
     assert weights[0].sum() == weights[1].sum()
     means = [weight @ one["mean"] / weight.sum() for weight, one in zip(weights, (fine, blocks), strict=True)]
