@@ -107,10 +107,10 @@ class TileHistory:
     """A tile before and after a run.
 
     Attributes:
-        before: Gaussians of the epoch, empty where the tile was not mapped.
+        before: Gaussians of the latest survey, empty where the tile was not mapped.
         after: Gaussians of the newest version.
         tile: the newest version as stored.
-        base: the version of the epoch as stored, None where the tile was not mapped.
+        base: that survey's version as stored, None where the tile was not mapped.
     """
 
     tile: StoredTile
@@ -125,7 +125,7 @@ class TileHistory:
 
 
 def tile_histories(store: SqlStore, layer: str = DEFAULT_LAYER) -> list[TileHistory]:
-    """Return every tile of a store as it was in its epoch and as it is now."""
+    """Return every tile of a store as it was surveyed last and as it is now."""
     return [_history(store, layer, entry.tile, entry.version) for entry in store.heads(layer)]
 
 
@@ -133,7 +133,11 @@ def _history(store: SqlStore, layer: str, tile: Any, version: int) -> TileHistor
     head = store.get(layer, tile, version)
     if head is None:
         raise LookupError(f"version {version} of tile {tile.path} was listed but is not there")
-    bases = [info.version for info in store.history(layer, tile) if info.kind != "merged"]
+    given = [info for info in store.history(layer, tile) if info.kind != "merged"]
+    surveys = [
+        info.version for info in given if info.kind == "base"
+    ]  # what was rolled back since is not the map before
+    bases = surveys or [info.version for info in given[:1]]
     base = store.get(layer, tile, bases[-1]) if bases else None
     before = Gaussians.empty() if base is None else base.decode_gaussians().gaussians
     return TileHistory(head, before, head.decode_gaussians().gaussians, base)

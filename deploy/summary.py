@@ -174,12 +174,16 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     lines += [
         f"{vehicle} doubts itself: {d['scans_shifted'] + d['scans_taken_back']} scans taken back, "
         f"{d['tiles_held_back']} tiles with {d['changes_held_back']} changes held back, {d['tiles_doubtful']} doubtful "
-        f"({', '.join(f'{n} {reason}' for reason, n in d['tiles'].items()) or 'none'}); largest shift "
+        f"({_reasons(d['tiles'])}); largest shift "
         f"{d['largest_shift_m'] * 100:.0f} cm, {d['largest_turn_deg']:.2f} degrees"
         for vehicle, d in summary.get("doubtful", {}).items()
     ]
     lines += feature_lines(summary.get("features", {}))
     return lines
+
+
+def _reasons(tiles: dict[str, int]) -> str:
+    return ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in tiles.items()) or "none"
 
 
 def _single_text(f1: dict[str, Any]) -> str:

@@ -107,7 +107,7 @@ def _cards(run: FinishedRun) -> str:
     wire = total["down_wire_bytes"] + total["up_wire_bytes"]
     items = [
         (f"{sum(count for count in run.versions):,}", f"versions of {len(run.tiles)} tiles"),
-        (f"{changed:,}", "voxels changed"),
+        (f"{changed:,}", "voxels differ from the map before"),
         ("–" if run.changes is None else f"{len(run.changes.changes):,}", "changes with two voxels or more"),
         (size_text(wire), "on the wire"),
     ]

@@ -32,5 +32,5 @@ def test_a_line_says_what_was_held_back_and_how_far_off_the_vehicle_was() -> Non
     }  # fmt: skip
     assert (
         "car-2 doubts itself: 45 scans taken back, 3 tiles with 314 changes held back, 3 doubtful "
-        "(3 explained_by_shift); largest shift 21 cm, 0.50 degrees"
+        "(3 explained by shift); largest shift 21 cm, 0.50 degrees"
     ) in summary_lines(summary)

@@ -77,7 +77,7 @@ def test_a_run_of_recorded_drives_is_told_without_truth(finished: Path) -> None:
     assert "There is no truth" in words
     assert "2 vehicles on recorded drives" in words
     assert f"{summary['reports_sent']} reports sent, {summary['reports_acknowledged']} acknowledged" in words
-    assert f"{summary['changed_voxels']:,} voxels changed" in words
+    assert f"{summary['changed_voxels']:,} voxels differ from the map before" in words
     for part in ("The map", "Changes", "Localisation", "Health", "Traffic", "Versions", "Settings", "Do it again"):
         assert part in words
     assert "vehicle-00" in words

@@ -13,6 +13,7 @@ from page_testing import EAST, HERE, LiveStreet, ServedPage, columns_of, live_st
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.verify import Verifier
+from gnd.deploy.account import tile_histories
 from gnd.fleet_bus.identity.authority import Authority
 from gnd.fleet_bus.identity.folder import AUTHORITY, CERTIFICATE, KEY, REVOKED
 from gnd.fleet_bus.identity.names import MemberName
@@ -220,3 +221,12 @@ def test_with_certificates_operators_decide_members_look_and_nobody_else(tmp_pat
         assert asked(port, context("bob"), "POST", path, word)[0] == 401
         assert asked(port, context("ann"), "POST", path, word)[0] == 200
     assert np.array_equal([version for version, _ in state_of(street)], [2, 2])
+
+
+def test_what_is_told_of_a_run_counts_from_the_survey_also_when_a_change_was_taken_back(
+    page: ServedPage, street: LiveStreet
+) -> None:
+    street.merge(street_tile(EAST, wall=True, hump=0.3), quietly=True)
+    lifted = {one.tile.tile: one.changed_voxels() for one in tile_histories(street.store)}[EAST] - 120
+    assert page.decide(change_of(page, "new")["key"], "roll_back", "not there").status == 200
+    assert {one.tile.tile: one.changed_voxels() for one in tile_histories(street.store)}[EAST] == lifted > 0
