@@ -25,6 +25,7 @@ from gnd.tile_store.errors import (
     StoreUnavailable,
 )
 from gnd.tile_store.idle import IdleConnections
+from gnd.tile_store.postgres_race import first_connection, hosts_of
 from gnd.tile_store.postgres_wire import BoundStatement, PostgresWire, columns_of
 from gnd.tile_store.sql import statements
 
@@ -267,7 +268,7 @@ def connect(conninfo: str, clock: DatabaseClock) -> PostgresConnection:
         told = conninfo_to_dict(conninfo)
         told.setdefault("connect_timeout", CONNECT_TIMEOUT_S)
         told.setdefault("application_name", "gnd")
-        raw = psycopg.connect(**told, autocommit=True)  # type: ignore[arg-type]
+        raw = first_connection(hosts_of(told))
     except psycopg.Error as error:
         raise _not_let_in(error, conninfo) from None
     try:

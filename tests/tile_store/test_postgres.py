@@ -1,6 +1,8 @@
 """What is PostgreSQL's own: the same tables as SQLite's, several processes that write at a time, and clear errors."""
 
+import socket
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -19,7 +21,7 @@ from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.uploads import Settled, Upload
 
 psycopg = pytest.importorskip("psycopg", reason="pip install 'gnd-fleet[postgres]'")
-from gnd.tile_store.postgres_connection import SQL, _require_new_enough  # noqa: E402
+from gnd.tile_store.postgres_connection import SQL, DatabaseClock, _require_new_enough, connect  # noqa: E402
 from gnd.tile_store.postgres_connection import shown as shown_conninfo  # noqa: E402
 from gnd.tile_store.postgres_store import PostgresStore  # noqa: E402
 from gnd.tile_store.postgres_wire import PostgresWire  # noqa: E402
@@ -204,6 +206,28 @@ def test_of_two_hosts_the_one_that_takes_writes_is_found(postgres: PostgresServe
     assert shown_conninfo(f"{told}?target_session_attrs=read-write&password=secret") == told
     assert shown_conninfo("host=a,b port=5432 dbname=d") == "postgresql://a:5432,b:5432/d"
     assert shown_conninfo("host=a dbname=d") == "postgresql://a/d"
+
+
+def test_a_silent_host_holds_nobody_up_and_one_that_takes_over_meanwhile_is_found(
+    postgres: PostgresServer, new_database: NewDatabase
+) -> None:
+    url = new_database()
+    name = url.split("/")[3].split("?")[0]
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts, nobody answers
+        port = silent.getsockname()[1]
+        both = f"{url.replace('?host=', '?host=127.0.0.1,')}&port={port},5432&target_session_attrs=read-write"
+        since_s = time.monotonic()
+        PostgresStore(both + "&connect_timeout=30").close()
+        postgres.sql(f"ALTER DATABASE {name} SET default_transaction_read_only = on")
+        with pytest.raises(StoreUnavailable, match="read-only.*timeout|timeout.*read-only"):
+            connect(both + "&connect_timeout=2", DatabaseClock())
+        later = threading.Timer(
+            0.2, postgres.sql, [f"ALTER DATABASE {name} RESET default_transaction_read_only"]
+        )
+        later.start()
+        PostgresStore(both + "&connect_timeout=30").close()
+        later.join()
+        assert time.monotonic() - since_s < 25.0, "30 s are what the silent host takes"
 
 
 def test_a_wrong_password_is_said_and_never_shown(postgres: PostgresServer, new_database: NewDatabase) -> None:
