@@ -7,10 +7,8 @@ comes late changes nothing.
 
 import logging
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from threading import Lock
 from typing import Final
 
 import numpy as np
@@ -45,7 +43,6 @@ from gnd.tile_store.store import Store
 from gnd.tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
 from gnd.tile_store.values import ReportRow
 
-REMEMBERED_DISTRICTS: Final = 32
 UPLOADS_AT_ONCE: Final = 8
 """Uploads that a thread claims together."""
 DAMAGED_RETRY_S: Final = 2.0
@@ -88,14 +85,6 @@ class Expander:
         self._features = FeatureInbox(store, config.features, config.feature_layer, config.ingest.reach_tiles)
         self._map, self._surveys = MapCheck(store, config.ingest), SurveyInbox(store)
         self.served = ServedCpu()
-        self._lock = Lock()
-        self._districts: OrderedDict[str, None] = OrderedDict()  # newest last
-
-    @property
-    def districts(self) -> tuple[str, ...]:
-        """Paths of the districts that reports were about lately, the newest first: their tiles are in memory."""
-        with self._lock:
-            return tuple(reversed(self._districts))
 
     def work(self) -> int:
         """Settle some uploads; how many were claimed.
@@ -151,7 +140,6 @@ class Expander:
 
     def _announce(self, outcome: _Outcome) -> None:
         if outcome.settled.rows:
-            self._remember(outcome.settled.rows[0].tile.district.path)
             self._on_journaled()
         if outcome.asks is not None:
             self._short.asks(outcome.asks)
@@ -159,13 +147,6 @@ class Expander:
             self._short.promises.forget(outcome.settled.claim.upload.report_id)
         if outcome.told is not None:
             self._tell(outcome.vehicle, outcome.told)
-
-    def _remember(self, path: str) -> None:
-        with self._lock:
-            self._districts.pop(path, None)
-            self._districts[path] = None
-            while len(self._districts) > REMEMBERED_DISTRICTS:
-                self._districts.popitem(last=False)
 
     def _understood(self, claim: UploadClaim) -> _Outcome:
         if claim.attempts > MAX_ATTEMPTS:  # it may be what killed the workers that claimed it before

@@ -153,7 +153,7 @@ def run_worker(
         while not stop.is_set():
             claims: list[Claim] = []
             try:
-                claims = store.claim(config.shard_id, TILES_AT_ONCE, config.lease_s, prefer=expander.districts)
+                claims = store.claim(config.shard_id, TILES_AT_ONCE, config.lease_s, is_own=members.is_mine)
                 leases.hold(claims)
                 worker.begin(claims)
                 for some in in_turn(claims):

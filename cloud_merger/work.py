@@ -43,6 +43,9 @@ ReportsT = TypeVar("ReportsT")
 MergedT = TypeVar("MergedT")
 SETTLED_TOGETHER: Final = 4
 """Tiles; more would wait too long for each other."""
+LEAST_IDLE_S: Final = 0.005
+OTHERS_IDLE_S: Final = 0.05
+"""While tiles of another shard are ready, a shard looks so often whether it should help."""
 
 
 class Worker:
@@ -108,8 +111,13 @@ class Worker:
         return result
 
     def idle_s(self, ready_in_s: float | None) -> float:
-        """How long to sleep: until the next tile is ready, at most `poll_s`."""
-        return self._config.poll_s if ready_in_s is None else min(max(ready_in_s, 0.005), self._config.poll_s)
+        """How long to sleep: until the next tile is ready, at most `poll_s`; one that is ready and was not given is
+        another shard's.
+        """
+        poll_s = self._config.poll_s
+        if ready_in_s is None:
+            return poll_s
+        return min(OTHERS_IDLE_S if ready_in_s <= 0.0 else max(ready_in_s, LEAST_IDLE_S), poll_s)
 
     def _attempt(self, claim: Claim) -> Publication | None:
         is_held = self._begun.pop(claim, None)

@@ -1,4 +1,4 @@
-"""Several hosts of a database, of which one takes writes: all are asked at once, so that a silent one holds up nobody."""
+"""Several hosts of a database, of which one takes writes: all are asked at once, and a silent one holds up nobody."""
 
 import queue
 import threading

@@ -4,13 +4,13 @@ import json
 import secrets
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from operator import itemgetter
 from typing import Any, Final, Protocol
 
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District, TileId
 from gnd.tile_store import sql_journal as journal
 from gnd.tile_store.connection import Lock, Row, SqlConnection, change, fetch, post
 from gnd.tile_store.districts import is_owned
-from gnd.tile_store.regions import morton_range
 from gnd.tile_store.rows_kept import RowsKept
 from gnd.tile_store.values import Claim, JournalMark, PutStatus, ReportRow, StoreConfig
 
@@ -22,10 +22,12 @@ ASIDE_S: Final = 60.0
 LONGEST_ASIDE_S: Final = 3600.0
 """... at most after so long: whoever was to blame for it may be gone by then."""
 ATTEMPTS_IN_A_ROW: Final = 5
-OVERDUE_S: Final = 2.0
-"""A tile that has been ready for so long goes before all preferred ones: under load there are always some."""
-LOOKED_AT: Final = 8
-"""Times as many of the oldest tiles as can be claimed are looked at for preferred ones."""
+HELP_AFTER_S: Final = 1.0
+"""So long a tile is left to the shard to which it belongs, which has what was said about it in memory ..."""
+HELP_FACTOR: Final = 2.0
+"""... and where others have some of their own to do, until it has waited so many times as long as those."""
+LOOKED_AT: Final = 16
+"""Times as many of the oldest tiles as can be claimed are looked at for own ones."""
 HALVES_WAIT: Final = 4
 """Merge delays that a tile waits for the Gaussians that were asked for, if nothing else is said about it."""
 CONTESTED_VOXELS: Final = 12
@@ -150,20 +152,33 @@ def merge_again(c: SqlConnection, layer: str, tile: TileId, timing: dict[str, An
     c.post_each("mark_dirty", [{"layer": layer, "tile": tile.morton, "seq": seq}], timing)
 
 
-def claim(c: SqlConnection, owner: str, n: int, lease_s: float, prefer: Sequence[str], steady: int) -> list[Claim]:
-    """Lease ready tiles: those that have waited for long, then those of the preferred regions, then any; each group
-    oldest first. Preferred tiles are in the owner's memory.
+IsOwn = Callable[[District], bool]
+"""Whether the tiles of a district belong to the shard that asks."""
+
+
+def claim(c: SqlConnection, owner: str, n: int, lease_s: float, is_own: IsOwn | None, steady: int) -> list[Claim]:
+    """Lease ready tiles, those first that have waited longest: the owner's own, and those of others that have waited
+    for `HELP_AFTER_S` and `HELP_FACTOR` times as long. None: all are its own.
     """
-    ranges = [morton_range(prefix) for prefix in prefer]
-    rows = fetch(c, "claimable", {"steady": steady, "n": LOOKED_AT * n if ranges else n})
+    at_most = n if is_own is None else LOOKED_AT * n
+    rows = fetch(c, "claimable", {"steady": steady, "n": at_most})
+    mine = rows if is_own is None else _own_first(rows, is_own, steady)
+    if not mine and len(rows) == at_most:  # its own may lie behind these
+        mine = rows
+    return _take(c, mine[:n], owner, steady + round(lease_s * NS_PER_S))
 
-    def turn(row: Row) -> int:
-        _, tile, *_, ready_ns = row
-        if steady - ready_ns >= OVERDUE_S * NS_PER_S:
-            return 0
-        return 1 if any(first <= tile < end for first, end in ranges) else 2
 
-    return _take(c, sorted(rows, key=turn)[:n], owner, steady + round(lease_s * NS_PER_S))
+def _own_first(rows: Iterable[Row], is_own: IsOwn, steady: int) -> list[Row]:
+    """Those that the owner may take, in the order of their turns."""
+    found, known = [], dict[int, bool]()
+    for row in rows:
+        waited_s, district = (steady - row[-1]) / NS_PER_S, row[1] // TILES_OF_DISTRICT
+        if district not in known:
+            known[district] = is_own(TileId(row[1]).district)
+        own = known[district]
+        if own or waited_s >= HELP_AFTER_S:
+            found.append((HELP_AFTER_S + HELP_FACTOR * waited_s if own else waited_s, row))
+    return [row for _, row in sorted(found, key=itemgetter(0), reverse=True)]
 
 
 def _take(c: SqlConnection, rows: Iterable[Row], owner: str, lease_ns: int) -> list[Claim]:

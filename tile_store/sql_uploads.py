@@ -18,6 +18,13 @@ from gnd.tile_store.values import PutStatus, ReportRow, StoreConfig
 NS_PER_S: Final = 1_000_000_000
 HEAD_START_NS: Final = NS_PER_S
 """So long an upload is left to the shard that received it, which holds its tiles in memory."""
+HELP_FACTOR: Final = 2.0
+"""Where a shard has some of its own to look at, it helps with what has waited so many times as long."""
+NEVER_NS: Final = (1 << 63) - 1
+MOST_OWN: Final = 1024
+"""Of a shard's own uploads the oldest are looked at to find whose they are; where there are more ..."""
+MOST_OWN_VEHICLES: Final = 256
+"""... so many vehicles are tried whose turn it is."""
 MOST_TURNS: Final = 4096
 """Vehicles that are looked at to find whose turn it is."""
 AT_ONCE_OF_VEHICLE: Final = 2
@@ -81,19 +88,43 @@ def turns(c: SqlConnection, after: str) -> tuple[list[str], str]:
     return found, ""
 
 
-def claim(c: SqlConnection, owner: str, n: int, lease_s: float, vehicles: Sequence[str]) -> list[UploadClaim]:
+def others_lag(c: SqlConnection, owner: str) -> bool:
+    """Whether what others have received has waited so much longer than what the owner has that it should help."""
+    oldest, own = fetch(c, "oldest_fresh"), fetch(c, "oldest_fresh_of", {"home": owner})
+    if not oldest or not own:
+        return True
+    now_ns = c.clock.steady_ns()
+    longest_ns, own_ns = (now_ns + HEAD_START_NS - lease_ns for ((lease_ns,),) in (oldest, own))
+    return bool(longest_ns > HEAD_START_NS + HELP_FACTOR * own_ns)
+
+
+def claim(
+    c: SqlConnection, owner: str, n: int, lease_s: float, vehicles: Sequence[str], *, helps: bool = True
+) -> list[UploadClaim]:
     """Lease uploads of several vehicles in this order, of each the oldest first. One that was claimed before comes
-    alone: it may be what ended its worker.
+    alone: it may be what ended its worker. Where the owner does not help others, only what it has received itself, or
+    what others have left; where there is none, any.
     """
-    rows = fetch(c, "free_uploads", _clock(c) | {"n": 1, "attempts": 1}) or _fresh(c, owner, n, vehicles)
+    rows = fetch(c, "free_uploads", _clock(c) | {"n": 1, "attempts": 1})
+    if not rows and not helps:
+        rows = _fresh(c, owner, n, _own(c, owner, vehicles), {"now": 0, "never": NEVER_NS})
+    rows = rows or _fresh(c, owner, n, vehicles, {})
     return [_lease(c, owner, lease_s, *row) for row in rows]
 
 
-def _fresh(c: SqlConnection, owner: str, n: int, vehicles: Sequence[str]) -> list[Row]:
+def _own(c: SqlConnection, owner: str, vehicles: Sequence[str]) -> Sequence[str]:
+    """Those of the vehicles of which the owner has received something; where very much waits, some that may be."""
+    oldest = fetch(c, "oldest_of_home", {"home": owner, "n": MOST_OWN})
+    own = {vehicle for (vehicle,) in oldest}
+    return vehicles[:MOST_OWN_VEHICLES] if len(oldest) == MOST_OWN else [one for one in vehicles if one in own]
+
+
+def _fresh(c: SqlConnection, owner: str, n: int, vehicles: Sequence[str], times: dict[str, int]) -> list[Row]:
+    """Times: when a lease counts as ended."""
     found: list[Row] = []
     each = max(AT_ONCE_OF_VEHICLE, n // max(1, len(vehicles)))
     for vehicle in vehicles:
-        wanted = _clock(c) | {"vehicle": vehicle, "home": owner, "n": min(each, n - len(found))}
+        wanted = _clock(c) | times | {"vehicle": vehicle, "home": owner, "n": min(each, n - len(found))}
         found += fetch(c, "fresh_uploads", wanted)
         if len(found) >= n:
             break

@@ -235,10 +235,11 @@ class SqlStore(ABC):
                 return []
             names, self._turns_after = uploads.turns(c, self._turns_after)
             is_any_left = uploads.any_left_behind(c)
+            helps = uploads.others_lag(c, owner)
         vehicles = in_turn(names)
         if not vehicles and not is_any_left:
             return []
-        return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s, vehicles), [inbox.CLAIMS])
+        return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s, vehicles, helps=helps), [inbox.CLAIMS])
 
     def uploads_waiting(self, vehicle: str | None, at_most: int) -> int:
         """See `Store.uploads_waiting`."""
@@ -354,13 +355,13 @@ class SqlStore(ABC):
 
     # The queue
 
-    def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
+    def claim(self, owner: str, n: int, lease_s: float, is_own: inbox.IsOwn | None = None) -> list[Claim]:
         """See `Store.claim`."""
         # Idle mergers look often: they take no write lock for nothing.
         ready_in_s = self.ready_in_s()
         if ready_in_s is None or ready_in_s > 0.0:
             return []
-        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._steady_ns()), [inbox.CLAIMS])
+        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, is_own, self._steady_ns()), [inbox.CLAIMS])
 
     def begin(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """See `Store.begin`."""

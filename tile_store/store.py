@@ -132,9 +132,12 @@ class Store(Protocol):
 
     # The queue
 
-    def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
-        """Lease up to `n` tiles that are ready to merge: overdue ones, then those in the regions `prefer` (path
-        prefixes), then any.
+    def claim(
+        self, owner: str, n: int, lease_s: float, is_own: Callable[[District], bool] | None = None
+    ) -> list[Claim]:
+        """Lease up to `n` tiles that are ready to merge, those first that have waited longest. `is_own` says of which
+        districts they belong to the owner: others it gets only where they have waited for long, and for much longer
+        than its own.
 
         Leases and delays run by a clock that does not step; those of an earlier boot of the machine are over.
         """

@@ -16,8 +16,8 @@ import simpy
 
 from gnd.cloud_merger.expander import UPLOADS_AT_ONCE
 from gnd.cloud_merger.merger import TILES_AT_ONCE
-from gnd.cloud_merger.work import SETTLED_TOGETHER
-from gnd.tile_store.sql_inbox import HALVES_WAIT, OVERDUE_S
+from gnd.cloud_merger.work import LEAST_IDLE_S, OTHERS_IDLE_S, SETTLED_TOGETHER
+from gnd.tile_store.sql_inbox import HALVES_WAIT, HELP_AFTER_S, HELP_FACTOR
 from gnd.tile_store.values import StoreConfig
 from studies.frame.errors import OptionError
 
@@ -117,9 +117,10 @@ class SimulatedReport:
 
 @dataclass(slots=True)
 class _Dirty:
-    """A tile that waits to be merged."""
+    """A tile that waits to be merged, and the shard to which it belongs: it receives all that is said about it."""
 
     ready_s: float
+    shard: int
     waiting: list[float] = field(default_factory=list)
     is_leased: bool = False
 
@@ -244,22 +245,22 @@ class CloudModel:
         delay_s = self._rules.merge_delay_s
         if is_half:
             for tile in one.asked:
-                self._mark(tile, came_s, delay_s, self._rules.merge_after)
+                self._mark(tile, one.shard, came_s, delay_s, self._rules.merge_after)
             self._open -= 1
             return
         for tile, said in one.says:
             self._window[tile] = self._window[tile] % StoreConfig().window_reports + 1
             if said == "asked":
-                self._mark(tile, came_s, HALVES_WAIT * delay_s, 1 << 30)
+                self._mark(tile, one.shard, came_s, HALVES_WAIT * delay_s, 1 << 30)
             elif said == "plain" or tile in self._dirty:  # nothing changes and nothing waits: no merge
-                self._mark(tile, came_s, delay_s, self._rules.merge_after)
+                self._mark(tile, one.shard, came_s, delay_s, self._rules.merge_after)
         if one.asked:
             self._env.process(self._answer(one))
         else:
             self._open -= 1
 
-    def _mark(self, tile: int, came_s: float, delay_s: float, merge_after: int) -> None:
-        dirty = self._dirty.setdefault(tile, _Dirty(self._env.now + delay_s))
+    def _mark(self, tile: int, shard: int, came_s: float, delay_s: float, merge_after: int) -> None:
+        dirty = self._dirty.setdefault(tile, _Dirty(self._env.now + delay_s, shard))
         dirty.waiting.append(came_s)
         is_full = len(dirty.waiting) >= merge_after
         dirty.ready_s = min(dirty.ready_s, self._env.now + (0.0 if is_full else delay_s))
@@ -294,24 +295,22 @@ class CloudModel:
                 yield self._env.timeout(self._idle_s())
 
     def _claimed(self, shard: int) -> list[int]:
-        """Ready tiles: overdue ones first, then the shard's own, then any; oldest first."""
-        now_s = self._env.now
-        ready = [(one.ready_s, tile) for tile, one in self._dirty.items() if one.ready_s <= now_s and not one.is_leased]
-
-        def turn(at: tuple[float, int]) -> tuple[int, float]:
-            ready_s, tile = at
-            if now_s - ready_s >= OVERDUE_S:
-                return 0, ready_s
-            return (1 if tile % self._rules.shards == shard else 2), ready_s
-
-        claims = [tile for _, tile in sorted(ready, key=turn)[:TILES_AT_ONCE]]
+        """Ready tiles, those first that have waited longest: the shard's own, and those of others that lag."""
+        now_s, turns = self._env.now, list[tuple[float, int]]()
+        for tile, one in self._dirty.items():
+            waited_s = now_s - one.ready_s
+            is_own = one.shard == shard
+            if not one.is_leased and waited_s >= (0.0 if is_own else HELP_AFTER_S):
+                turns.append((HELP_AFTER_S + HELP_FACTOR * waited_s if is_own else waited_s, tile))
+        claims = [tile for _, tile in sorted(turns, key=lambda turn: (-turn[0], turn[1]))[:TILES_AT_ONCE]]
         for tile in claims:
             self._dirty[tile].is_leased = True
         return claims
 
     def _idle_s(self) -> float:
         soonest_s = min((one.ready_s for one in self._dirty.values() if not one.is_leased), default=float("inf"))
-        return min(max(soonest_s - self._env.now, 0.005), self._rules.poll_s)
+        wait_s = soonest_s - self._env.now
+        return min(OTHERS_IDLE_S if wait_s <= 0.0 else max(wait_s, LEAST_IDLE_S), self._rules.poll_s)
 
     def _published(self, tile: int, count: int, read: int) -> None:
         dirty = self._dirty[tile]

@@ -219,11 +219,9 @@ def test_a_silent_host_holds_nobody_up_and_one_that_takes_over_meanwhile_is_foun
         since_s = time.monotonic()
         PostgresStore(both + "&connect_timeout=30").close()
         postgres.sql(f"ALTER DATABASE {name} SET default_transaction_read_only = on")
-        with pytest.raises(StoreUnavailable, match="read-only.*timeout|timeout.*read-only"):
+        with pytest.raises(StoreUnavailable, match=r"read-only.*timeout|timeout.*read-only"):
             connect(both + "&connect_timeout=2", DatabaseClock())
-        later = threading.Timer(
-            0.2, postgres.sql, [f"ALTER DATABASE {name} RESET default_transaction_read_only"]
-        )
+        later = threading.Timer(0.2, postgres.sql, [f"ALTER DATABASE {name} RESET default_transaction_read_only"])
         later.start()
         PostgresStore(both + "&connect_timeout=30").close()
         later.join()

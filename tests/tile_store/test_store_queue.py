@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 from store_helpers import EAGER, EAST, FAR, TILE, Clock, Maker, of_a_file, only_claim, publication, report
 
+from gnd.gnd_map.tile_id import District, TileId
 from gnd.tile_store import clocks
-from gnd.tile_store.errors import StoreError
+from gnd.tile_store.sql_inbox import LOOKED_AT
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import StoreConfig
 
@@ -119,33 +120,44 @@ def test_only_the_holder_can_postpone(store: Store, clock: Clock) -> None:
     assert store.claim("m3", 1, 10.0) == []
 
 
-def test_a_tile_of_nobodys_region_does_not_wait_for_ever(store: Store, clock: Clock) -> None:
-    own = "13033/03021/23031"
-    store.put_reports([report(1, FAR)])
-    clock.advance(3.0)
-    store.put_reports([report(1, TILE)])
-    assert [claim.tile for claim in store.claim("m1", 1, 10.0, prefer=[own])] == [FAR], "it is overdue"
-    store.put_reports([report(2, EAST)])
-    assert [claim.tile for claim in store.claim("m1", 2, 10.0, prefer=[own])] == [TILE, EAST]
+def of_here(district: District) -> bool:
+    return district == TILE.district
 
 
-def test_own_regions_come_first_then_any(store: Store) -> None:
+def test_another_shards_tile_is_left_to_it_for_a_second(store: Store, clock: Clock) -> None:
     store.put_reports([report(1, FAR), report(1, TILE), report(1, EAST)])
-    (first,) = store.claim("m1", 1, 10.0, prefer=["13033/03021/23031"])
-    assert first.tile == TILE
-    rest = store.claim("m1", 10, 10.0, prefer=("02", "13033/03021"))
-    assert [claim.tile for claim in rest] == [EAST, FAR]
+    assert [claim.tile for claim in store.claim("m1", 10, 10.0, of_here)] == [TILE, EAST]
+    assert store.ready_in_s() == 0.0
+    clock.advance(0.999)
+    assert store.claim("m1", 10, 10.0, of_here) == []
+    clock.advance(0.002)
+    assert [claim.tile for claim in store.claim("m1", 10, 10.0, of_here)] == [FAR]
 
 
-def test_a_region_that_is_none_is_refused(store: Store) -> None:
-    store.put_reports([report(1)])
-    with pytest.raises(StoreError, match="13a33"):
-        store.claim("m1", 1, 10.0, prefer=["13a33"])
+def test_who_has_tiles_of_its_own_helps_where_others_lag_twice_as_far(store: Store, clock: Clock) -> None:
+    store.put_reports([report(1, FAR)])
+    clock.advance(5.0)
+    store.put_reports([report(1, TILE)])
+    clock.advance(3.0)
+    assert [claim.tile for claim in store.claim("m1", 2, 0.1, of_here)] == [FAR, TILE], "8 s are more than 1 + 2 * 3"
+    clock.advance(1.1)
+    assert [claim.tile for claim in store.claim("m1", 2, 1.0, of_here)] == [TILE, FAR], (
+        "9.1 s are less than 1 + 2 * 4.1"
+    )
+
+
+def test_own_tiles_behind_very_many_of_a_slow_shard_are_not_waited_for(store: Store, clock: Clock) -> None:
+    first = FAR.district.first_morton
+    store.put_reports([report(1, TileId(first + k)) for k in range(LOOKED_AT + 1)])
+    clock.advance(0.1)
+    store.put_reports([report(1, TILE)])
+    (claim,) = store.claim("m1", 1, 10.0, of_here)
+    assert claim.tile.district == FAR.district, "it has looked at no other ones"
 
 
 def test_never_more_tiles_than_asked_for(store: Store) -> None:
     store.put_reports([report(1, tile) for tile in (TILE, EAST, FAR)])
-    assert len(store.claim("m1", 2, 10.0, prefer=["1", "0", "13033"])) == 2
+    assert len(store.claim("m1", 2, 10.0, lambda _: True)) == 2
     assert store.claim("m1", 0, 10.0) == []
 
 

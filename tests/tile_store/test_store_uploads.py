@@ -95,6 +95,24 @@ def test_who_received_an_upload_has_a_second_before_others(store: Store, machine
     assert len(claimed(store, "b")) == 1
 
 
+def test_who_has_uploads_of_its_own_helps_where_others_lag_twice_as_far(store: Store, machine: Machine) -> None:
+    store.put_upload(flags(1), "b")
+    machine.now += 2 * SECOND
+    store.put_upload(flags(2, vehicle="v2"), "a")
+    machine.now += 2 * SECOND
+    assert numbers(claimed(store)) == [b"\2"], "4 s are less than 1 + 2 * 2"
+    store.put_upload(flags(3, vehicle="v2"), "a")
+    machine.now += SECOND
+    assert numbers(claimed(store)) == [b"\1", b"\3"], "5 s are more than 1 + 2 * 1"
+
+
+def test_who_has_none_of_its_own_helps(store: Store, machine: Machine) -> None:
+    store.put_upload(flags(1), "b")
+    assert claimed(store) == []
+    machine.now += SECOND
+    assert numbers(claimed(store)) == [b"\1"]
+
+
 def test_a_lease_ends_by_the_clock_of_the_machine_and_not_by_the_date(
     store: Store, machine: Machine, clock: Clock
 ) -> None:

@@ -716,6 +716,18 @@ WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle
       (SELECT o.state FROM district_owner AS o WHERE o.district = -1), 'owned') IN ('owned', 'copying')
 ORDER BY upload LIMIT :n FOR UPDATE SKIP LOCKED
 
+-- name: oldest_fresh
+SELECT lease_ns FROM upload
+WHERE state = 'waiting' AND attempts = 0 ORDER BY attempts, upload LIMIT 1
+
+-- name: oldest_fresh_of
+SELECT lease_ns FROM upload
+WHERE state = 'waiting' AND attempts = 0 AND home = :home ORDER BY upload LIMIT 1
+
+-- name: oldest_of_home
+SELECT vehicle FROM upload
+WHERE state = 'waiting' AND attempts = 0 AND home = :home ORDER BY upload LIMIT :n
+
 -- name: free_uploads
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload
 WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) AND attempts >= :attempts

@@ -883,6 +883,18 @@ WHERE state = 'waiting' AND attempts = 0 AND vehicle = :vehicle
       (SELECT o.state FROM district_owner AS o WHERE o.district = -1), 'owned') IN ('owned', 'copying')
 ORDER BY upload LIMIT :n
 
+-- name: oldest_fresh
+SELECT lease_ns FROM upload INDEXED BY upload_waiting
+WHERE state = 'waiting' AND attempts = 0 ORDER BY attempts, upload LIMIT 1
+
+-- name: oldest_fresh_of
+SELECT lease_ns FROM upload INDEXED BY upload_fresh
+WHERE state = 'waiting' AND attempts = 0 AND home = :home ORDER BY upload LIMIT 1
+
+-- name: oldest_of_home
+SELECT vehicle FROM upload INDEXED BY upload_fresh
+WHERE state = 'waiting' AND attempts = 0 AND home = :home ORDER BY upload LIMIT :n
+
 -- name: any_fresh_upload
 SELECT 1 FROM upload INDEXED BY upload_fresh WHERE state = 'waiting' AND attempts = 0 AND home = :home LIMIT 1
 
