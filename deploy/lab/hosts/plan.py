@@ -133,8 +133,8 @@ class HostsPlan:
         """The store, on whichever of the two hosts takes writes; a host that is silent is given up within seconds."""
         hosts = ",".join(f"{self.host_of(part).address}:{DATABASE_PORT}" for part in DATABASES)
         words = (
-            "target_session_attrs=read-write", "connect_timeout=2", "tcp_user_timeout=2000",
-            "keepalives_idle=1", "keepalives_interval=1", "keepalives_count=2",
+            "target_session_attrs=read-write", "connect_timeout=2", "tcp_user_timeout=1000",
+            "keepalives_idle=1", "keepalives_interval=1", "keepalives_count=1",
         )  # fmt: skip
         return f"postgresql://gnd@{hosts}/gnd?{'&'.join(words)}"
 
