@@ -34,13 +34,15 @@ NOTICE_DELTA_PUT: Final = 128
 # The worker of an owner that lives may be starting, stopped, or without room on its disk: its notices go out all the
 # same.
 OTHERS_AFTER_S: Final = 0.3
+# Who is busy itself finds the owner busy, too: it is given more time, for it has in memory what a notice is made of.
+BUSY_OTHERS_AFTER_S: Final = 2.0
 _LOG = logging.getLogger(__name__)
 Read = Callable[[StoredTile], AnyTile]
 
 
 class Announcer:
     """Announces the versions of the districts that this shard owns, oldest first, then unmarks them; and those of
-    others that still wait `OTHERS_AFTER_S` after it has seen them first.
+    others that still wait `OTHERS_AFTER_S` after it has seen them first, or `BUSY_OTHERS_AFTER_S` while it is busy.
 
     The last notice of each of the newest `REMEMBERED_KEYS` tiles is repeated to late subscribers. Versions that were
     merged here lie in `bases`, and are not decoded again.
@@ -52,26 +54,27 @@ class Announcer:
         self._last_s = -math.inf
         self._seen_s: dict[Notice, float] = {}  # notices of others, since when, by the monotonic clock
 
-    def announce(self, at_most: int, every_s: float = 0.0) -> int:
+    def announce(self, at_most: int, every_s: float = 0.0, *, is_busy: bool = False) -> int:
         """Announce what waits, up to `at_most` versions; the number announced (0 without a router, and where the last
-        round was less than `every_s` ago).
+        round was less than `every_s` ago). `is_busy`: this shard has tiles to merge.
         """
         now_s = time.monotonic()
         if now_s - self._last_s < every_s or not self._bus.is_connected():
             return 0  # a notice put without a router would vanish in silence
         self._last_s = now_s
-        waiting = self._own_and_late(self._store.notices(n=at_most))
+        late_s = BUSY_OTHERS_AFTER_S if is_busy else OTHERS_AFTER_S
+        waiting = self._own_and_late(self._store.notices(n=at_most), late_s)
         for notice in waiting:
             self._announce(notice)
         if waiting:
             self._store.announced(waiting)
         return len(waiting)
 
-    def _own_and_late(self, waiting: Sequence[Notice]) -> list[Notice]:
+    def _own_and_late(self, waiting: Sequence[Notice], late_s: float) -> list[Notice]:
         now_s = time.monotonic()
         foreign = [one for one in waiting if not self._members.is_mine(one.tile.district)]
         self._seen_s = {one: self._seen_s.get(one, now_s) for one in foreign}
-        return [one for one in waiting if now_s - self._seen_s.get(one, 0.0) >= OTHERS_AFTER_S]
+        return [one for one in waiting if now_s - self._seen_s.get(one, -math.inf) >= late_s]
 
     def _announce(self, notice: Notice) -> None:
         stored = self._store.get(notice.layer, notice.tile, notice.version)

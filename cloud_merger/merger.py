@@ -162,8 +162,8 @@ def run_worker(
                     for claim in some:
                         leases.drop(claim)
                     # after the commit; tiles of one batch are announced together
-                    metrics.announced(announcer.announce(ANNOUNCE_AT_ONCE, every_s=ANNOUNCE_EVERY_S))
-                n_announced = announcer.announce(ANNOUNCE_AT_ONCE)
+                    metrics.announced(announcer.announce(ANNOUNCE_AT_ONCE, every_s=ANNOUNCE_EVERY_S, is_busy=True))
+                n_announced = announcer.announce(ANNOUNCE_AT_ONCE, is_busy=bool(claims))
                 metrics.announced(n_announced)
                 if not claims and not n_announced:
                     wake.wait(worker.idle_s(store.ready_in_s()))
