@@ -106,6 +106,19 @@ def test_who_has_uploads_of_its_own_helps_where_others_lag_twice_as_far(store: S
     assert numbers(claimed(store)) == [b"\1", b"\3"], "5 s are more than 1 + 2 * 1"
 
 
+def test_where_very_much_waits_own_uploads_come_first_all_the_same(
+    store: Store, machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gnd.tile_store.sql_uploads.MOST_OWN", 2)
+    store.put_upload(flags(1), "b")
+    machine.now += SECOND
+    for number in (2, 3, 4):
+        store.put_upload(flags(number, vehicle=f"v{number}"), "a")
+    machine.now += SECOND
+    assert numbers(claimed(store)) == [b"\2", b"\3", b"\4"]
+    assert numbers(claimed(store)) == [b"\1"], "it has none of its own any more"
+
+
 def test_who_has_none_of_its_own_helps(store: Store, machine: Machine) -> None:
     store.put_upload(flags(1), "b")
     assert claimed(store) == []
