@@ -248,4 +248,6 @@ def test_a_lease_that_was_lost_before_its_turn_is_no_work_and_no_crash(store, wo
 
 def test_idle_time_ends_when_the_next_tile_is_ready(store, worker):
     assert worker.idle_s(None) == ShardConfig().poll_s
-    assert worker.idle_s(-3.0) == pytest.approx(0.005)
+    assert worker.idle_s(0.1) == pytest.approx(0.1)
+    assert worker.idle_s(0.001) == pytest.approx(0.005)
+    assert worker.idle_s(-3.0) == pytest.approx(0.05), "it was not given: it is another shard's"
