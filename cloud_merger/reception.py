@@ -106,7 +106,7 @@ class Reception:
                 self._declared.pop(place).close()
 
     def _own(self, request: Request) -> bytes:
-        return self._answered(request).encode()
+        return _encoded(self._answered(request), request)
 
     def _answered(self, request: Request) -> ChangeAck:
         try:
@@ -130,7 +130,7 @@ class Reception:
         ack = self._answered(request)
         if ack.status != "quarantined":
             self._declare(place)
-        return ack.encode()
+        return _encoded(ack, request)
 
     def look_again(self) -> None:
         """Believe the tokens of shards that the store has come to know meanwhile, of none that it forgot; and give up
@@ -185,6 +185,10 @@ class UploadTurns:
                 self._vehicle_of[report_id] = vehicle
                 if len(self._vehicle_of) > REMEMBERED_REPORTS:
                     self._vehicle_of.popitem(last=False)
+
+
+def _encoded(ack: ChangeAck, request: Request) -> bytes:
+    return (ack.unnamed() if request.binds else ack).encode()
 
 
 def _place(key: str) -> Place | None:

@@ -5,6 +5,9 @@ read nothing from what was said (forward secrecy). The answer that brings the se
 question with the first half; so is a report's question. From the secret follow, by HKDF-SHA-256 over both halves, the
 question and both names, a key for each direction and the 3 bytes that name them.
 
+The highest bit of a half is none of the key (RFC 7748): there a part says that it knows terse seals. Both halves are
+part of what is signed or bound, so nobody in between can alter it unseen; a part of an older release leaves it 0.
+
 Whom a key speaks for is asked of the certificates each time it is used: a member that is revoked, or whose certificate
 has ended, has no keys either.
 """
@@ -12,13 +15,27 @@ has ended, has no keys either.
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
-from typing import TYPE_CHECKING, Final
+from hmac import compare_digest
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from gnd.fleet_bus.errors import SealError
 from gnd.fleet_bus.seals import Holder
-from gnd.fleet_bus.short_seals import BARE_MAC_BYTES, KEY_ID_BYTES, MAC_BYTES, MOST_COUNT, ShortSeal, check_mac, mac_of
+from gnd.fleet_bus.short_seals import (
+    BARE_MAC_BYTES,
+    KEY_ID_BYTES,
+    MAC_BYTES,
+    MOST_COUNT,
+    ShortSeal,
+    ShortWhat,
+    TerseSeal,
+    check_mac,
+    mac_of,
+    mac_over,
+    terse_id,
+)
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
@@ -36,7 +53,11 @@ MOST_PARTS: Final = 16
 """Parts of the cloud that a part keeps a key with."""
 KEYS_REMEMBERED: Final = 256
 OFFER_AGAIN_S: Final = 5.0
+MOST_ALIKE: Final = 64
+"""Keys that one terse seal may name; full tables have 5 in the mean."""
 _SECRET_BYTES: Final = 32
+_KNOWS_TERSE: Final = 0x80
+"""In the last byte of a half."""
 
 
 class ReplayWindow:
@@ -66,6 +87,7 @@ class AgreedKey:
         key_id: 3 bytes, as seals name it.
         other: who is at the other end; None = somebody who has not said so.
         is_used: the other side has shown that it has the key, too.
+        is_terse: both sides know terse seals, and use them.
     """
 
     key_id: bytes
@@ -73,9 +95,11 @@ class AgreedKey:
     _asks: bytes = field(repr=False)
     _tells: bytes = field(repr=False)
     is_used: bool = False
+    is_terse: bool = False
     _made_s: float = field(default_factory=time.monotonic)
     _asked: int = 0
     _told: int = 0
+    _newest: int = 0
     _windows: dict[int, ReplayWindow] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -102,6 +126,27 @@ class AgreedKey:
             blank = ShortSeal("notice", b"", self.key_id, self._told)
         return self._with_mac(blank, self._tells, key, payload, b"", MAC_BYTES)
 
+    def written(self, seal: ShortSeal) -> bytes:
+        """A seal under this key as it goes out."""
+        return seal.encode_terse() if self.is_terse else seal.encode()
+
+    def read_answer(self, attachment: bytes) -> ShortSeal:
+        """The seal of an answer under this key; raises SealError."""
+        if self.is_terse and len(attachment) == MAC_BYTES:
+            return ShortSeal("answer", attachment)
+        return ShortSeal.decode(attachment)
+
+    def read_terse(self, seal: TerseSeal, what: ShortWhat) -> ShortSeal:
+        """The seal of a question or a notice in full, if it is under this key; raises SealError."""
+        with self._lock:
+            newest = self._newest
+        return seal.whole(what, self.key_id, newest)
+
+    def has_made(self, seal: ShortSeal, key: str, payload_sha: bytes) -> bool:
+        """Whether a question or a notice that has come is under this key; its number is not looked at."""
+        secret = self._asks if seal.what == "question" else self._tells
+        return compare_digest(mac_over(secret, seal, key, payload_sha, b"", len(seal.mac)), seal.mac)
+
     def check_question(self, seal: ShortSeal, key: str, payload: bytes, handler: int, *, is_bare: bool) -> None:
         """Whether the other side asks this, for the first time of that handler; raises SealError."""
         check_mac(self._asks, seal, key, payload, b"", BARE_MAC_BYTES if is_bare else MAC_BYTES)
@@ -121,6 +166,7 @@ class AgreedKey:
         with self._lock:
             if not self._windows.setdefault(handler, ReplayWindow()).take(count):
                 raise SealError(f"number {count} of a short seal was used before: somebody repeats a message")
+            self._newest = max(self._newest, count)
 
     @staticmethod
     def _with_mac(blank: ShortSeal, secret: bytes, key: str, payload: bytes, digest: bytes, size: int) -> ShortSeal:
@@ -140,7 +186,9 @@ class KeyHalf:
         from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
         secret = X25519PrivateKey.generate()
-        return cls(secret, secret.public_key().public_bytes_raw())
+        share = bytearray(secret.public_key().public_bytes_raw())
+        share[-1] |= _KNOWS_TERSE
+        return cls(secret, bytes(share))
 
     def agree(
         self, theirs: bytes, question: bytes, answers: Holder, asks: Holder | None, *, is_asker: bool
@@ -171,7 +219,8 @@ class KeyHalf:
         size = 2 * _SECRET_BYTES + KEY_ID_BYTES
         made = HKDF(hashes.SHA256(), size, salt=sha256(bound).digest(), info=b"gnd agreed key 1").derive(secret)
         asking, telling, key_id = made[:_SECRET_BYTES], made[_SECRET_BYTES:-KEY_ID_BYTES], made[-KEY_ID_BYTES:]
-        return AgreedKey(key_id, answers if is_asker else asks, asking, telling)
+        is_terse = bool(self.share[-1] & theirs[-1] & _KNOWS_TERSE)
+        return AgreedKey(key_id, answers if is_asker else asks, asking, telling, is_terse=is_terse)
 
 
 def _names(holder: Holder | None) -> bytes:
@@ -186,6 +235,7 @@ class GrantedKeys:
         self._named: OrderedDict[bytes, AgreedKey] = OrderedDict()
         self._unnamed: OrderedDict[bytes, AgreedKey] = OrderedDict()
         self._of_name: dict[str, list[bytes]] = {}
+        self._of_terse: dict[int, list[bytes]] = {}
 
     def grant(self, theirs: bytes, question: bytes, own: Holder, asker: Holder | None) -> bytes:
         """Agree on a key with who has asked: the half to send; empty where there is to be none.
@@ -212,6 +262,12 @@ class GrantedKeys:
                     return table[key_id]
         return None
 
+    def find_alike(self, number: int) -> list[AgreedKey]:
+        """The keys that a terse seal may name, the newest first."""
+        with self._lock:
+            alike = [self._named.get(one) or self._unnamed[one] for one in self._of_terse.get(number, [])[::-1]]
+        return [one for one in alike if one.is_terse]
+
     def of_name(self, name: str) -> AgreedKey | None:
         """The newest key with that member, if it has used it: else it may be gone there."""
         with self._lock:
@@ -225,25 +281,56 @@ class GrantedKeys:
             self._named.clear()
             self._unnamed.clear()
             self._of_name.clear()
+            self._of_terse.clear()
 
     def _add(self, agreed: AgreedKey) -> None:
+        self._of_terse.setdefault(terse_id(agreed.key_id), []).append(agreed.key_id)
         if agreed.other is None:
             self._unnamed[agreed.key_id] = agreed
             if len(self._unnamed) > MOST_UNNAMED:
-                self._unnamed.popitem(last=False)
-            return
-        self._named[agreed.key_id] = agreed
-        of_name = self._of_name.setdefault(agreed.other.name, [])
-        of_name.append(agreed.key_id)
-        if len(of_name) > KEYS_A_MEMBER:
-            del self._named[of_name.pop(0)]
-        if len(self._named) > MOST_NAMED:
-            key_id, oldest = self._named.popitem(last=False)
-            assert oldest.other is not None
-            left = self._of_name[oldest.other.name]
-            left.remove(key_id)
-            if not left:
-                del self._of_name[oldest.other.name]
+                self._drop(next(iter(self._unnamed)))
+        else:
+            self._named[agreed.key_id] = agreed
+            of_name = self._of_name.setdefault(agreed.other.name, [])
+            of_name.append(agreed.key_id)
+            if len(of_name) > KEYS_A_MEMBER:
+                self._drop(of_name[0])
+            if len(self._named) > MOST_NAMED:
+                self._drop(next(iter(self._named)))
+        alike = self._of_terse[terse_id(agreed.key_id)]
+        if len(alike) > MOST_ALIKE:
+            self._drop(next((one for one in alike if one in self._unnamed), alike[0]))
+
+    def _drop(self, key_id: bytes) -> None:
+        """Forget a key; its holder is asked for a signature."""
+        agreed = self._unnamed.pop(key_id, None) or self._named.pop(key_id)
+        _remove(self._of_terse, terse_id(key_id), key_id)
+        if agreed.other is not None:
+            _remove(self._of_name, agreed.other.name, key_id)
+
+
+_PlaceT = TypeVar("_PlaceT")
+
+
+def _remove(table: dict[_PlaceT, list[bytes]], place: _PlaceT, key_id: bytes) -> None:
+    table[place].remove(key_id)
+    if not table[place]:
+        del table[place]
+
+
+def under_terse(alike: Sequence[AgreedKey], seal: TerseSeal, what: ShortWhat, key: str, payload: bytes) -> AgreedKey:
+    """Which of the keys that a terse seal may name it is under; of a single one that is still to be checked.
+
+    Raises:
+        SealError: none of them.
+    """
+    if len(alike) == 1:
+        return alike[0]
+    payload_sha = sha256(payload).digest() if alike else b""
+    for one in alike:
+        if one.has_made(one.read_terse(seal, what), key, payload_sha):
+            return one
+    raise SealError(f"the terse seal of a {what} under a key that is not known here")
 
 
 class HeldKeys:
@@ -303,6 +390,11 @@ class HeldKeys:
         """The key of that id."""
         with self._lock:
             return next((one for one in self._of_part.values() if one.key_id == key_id), None)
+
+    def find_alike(self, number: int) -> list[AgreedKey]:
+        """The keys that a terse seal may name."""
+        with self._lock:
+            return [one for one in self._of_part.values() if one.is_terse and terse_id(one.key_id) == number]
 
     def forget(self, key: str, agreed: AgreedKey) -> None:
         """The other side does not have it, or is somebody else."""

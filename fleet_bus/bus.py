@@ -257,6 +257,11 @@ class Bus:
         return wire
 
     @property
+    def binds_answers(self) -> bool:
+        """Whether an answer that `request` gives is proven to be one to that question, where its kind is sealed."""
+        return self._connection.sealing is not None
+
+    @property
     def connections(self) -> int:
         """How many connections to a router there have been: more than before = notices were missed (Linux)."""
         return self._connection.meter.read().connections

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from gnd.fleet_bus.agreed_keys import AgreedKey, GrantedKeys, HeldKeys, KeyHalf
+from gnd.fleet_bus.agreed_keys import AgreedKey, GrantedKeys, HeldKeys, KeyHalf, under_terse
 from gnd.fleet_bus.errors import BusError, NotMine, SealError
 from gnd.fleet_bus.seal_keys import KnownCertificates, certificates_of, holder_of, load_authority, load_signer
 from gnd.fleet_bus.seals import (
@@ -29,7 +29,7 @@ from gnd.fleet_bus.seals import (
     check_signature,
     question_digest,
 )
-from gnd.fleet_bus.short_seals import ShortSeal, is_short
+from gnd.fleet_bus.short_seals import ShortSeal, TerseSeal, is_short, is_terse
 
 if TYPE_CHECKING:
     from gnd.fleet_bus.serving import Request
@@ -85,6 +85,11 @@ class HeardQuestion:
     digest: bytes
     agreed: AgreedKey | None = None
     share: bytes = b""
+
+    @property
+    def binds(self) -> bool:
+        """Whether who asks checks that an answer is to this question, and does without what the answer says of that."""
+        return self.agreed is not None and self.agreed.is_terse
 
 
 class Sealing:
@@ -161,7 +166,7 @@ class Sealing:
             agreed = self._held.to_use(key, role)
             if agreed is not None and self._is_good(agreed):
                 seal = agreed.question(key, payload, is_bare=_chunk(key, 2) not in ASKED_BY)
-                return SealedQuestion(seal.encode(), question_digest(key, payload, seal.head), agreed)
+                return SealedQuestion(agreed.written(seal), question_digest(key, payload, seal.head), agreed)
         if role is not None and self._held.may_offer(role):
             half = KeyHalf.make()
         signed = self._signer.question(
@@ -172,7 +177,7 @@ class Sealing:
     def answer(self, key: str, payload: bytes, heard: HeardQuestion, *, refusal: bool = False) -> bytes:
         """Seal an answer: in short where the question was; else signed, with half of a key if one was offered."""
         if heard.agreed is not None:
-            return heard.agreed.answer(key, payload, heard.digest, refusal=refusal).encode()
+            return heard.agreed.written(heard.agreed.answer(key, payload, heard.digest, refusal=refusal))
         share = b""
         if heard.share and not refusal:
             share = self._granted.grant(heard.share, heard.digest, self.own, heard.asker)
@@ -184,7 +189,7 @@ class Sealing:
             return None
         agreed = self._granted.of_name(_chunk(key, 3)) if _chunk(key, 2) in TO_ONE else None
         if agreed is not None and self._is_good(agreed):
-            return agreed.notice(key, payload).encode()
+            return agreed.written(agreed.notice(key, payload))
         return self._signer.notice(key, payload).encode()
 
     def ended(self, key: str, sealed: SealedQuestion, *, signature_wanted: bool) -> None:
@@ -236,7 +241,13 @@ class Sealing:
 
     def _check_short_question(self, key: str, payload: bytes, attachment: bytes, handler: int) -> HeardQuestion:
         """As `check_question`; SealError where a signature would say more."""
-        seal, wanted = ShortSeal.decode(attachment), ASKED_BY.get(_chunk(key, 2))
+        wanted = ASKED_BY.get(_chunk(key, 2))
+        if is_terse(attachment):
+            terse = TerseSeal.decode(attachment)
+            of_key = under_terse(self._granted.find_alike(terse.terse_id), terse, "question", key, payload)
+            seal = of_key.read_terse(terse, "question")
+        else:
+            seal = ShortSeal.decode(attachment)
         agreed = self._granted.find(seal.key_id) if seal.what == "question" else None
         if agreed is None or (wanted is not None and agreed.other is None):
             raise SealError(f"the short seal of a {seal.what} under a key that is not known here")
@@ -269,8 +280,11 @@ class Sealing:
     def _check_short_answer(
         self, asked: str, key: str, payload: bytes, attachment: bytes, sealed: SealedQuestion
     ) -> bool:
-        seal, agreed = ShortSeal.decode(attachment), sealed.agreed
-        if agreed is None or agreed.other is None or seal.what not in ("answer", "refusal"):
+        agreed = sealed.agreed
+        if agreed is None or agreed.other is None:
+            raise SealError("a short seal on the answer to a question that was signed")
+        seal = agreed.read_answer(attachment)
+        if seal.what not in ("answer", "refusal"):
             raise SealError(f"the short seal of a {seal.what} on an answer")
         agreed.check_answer(seal, key, payload, sealed.digest)
         self._check_end(agreed, ANSWERED_BY[_chunk(asked, 2)], key)
@@ -308,7 +322,12 @@ class Sealing:
         self._check(seal, self._holder(seal), wanted, key, payload, b"")
 
     def _check_short_notice(self, wanted: str, key: str, payload: bytes, attachment: bytes) -> None:
-        seal = ShortSeal.decode(attachment)
+        if is_terse(attachment):
+            terse = TerseSeal.decode(attachment)
+            of_key = under_terse(self._held.find_alike(terse.terse_id), terse, "notice", key, payload)
+            seal = of_key.read_terse(terse, "notice")
+        else:
+            seal = ShortSeal.decode(attachment)
         if seal.what != "notice" or _chunk(key, 2) not in TO_ONE:
             raise SealError(f"the short seal of a {seal.what} on a notice")
         agreed = self._held.find(seal.key_id)

@@ -36,12 +36,14 @@ _LOG = logging.getLogger(__name__)
 class Request:
     """A request as its handler sees it: the key expression that was asked, and the payload.
 
-    `asker` is who has sealed it, where seals are demanded and it matters who asks; else None.
+    `asker` is who has sealed it, where seals are demanded and it matters who asks; else None. `binds`: who asks checks
+    that an answer is to this question, so that the answer need not say so.
     """
 
     key: str
     payload: bytes
     asker: Holder | None = None
+    binds: bool = False
 
     @property
     def is_wild(self) -> bool:
@@ -170,7 +172,7 @@ class Serving(Part):
                 heard = HeardQuestion(None, question_digest(key, payload, number_of(attachment)))
                 self._refuse(query, key, str(error), heard, attachment)
                 return
-        request = Request(key, payload, heard.asker)
+        request = Request(key, payload, heard.asker, heard.binds)
         try:
             answer = self._handler(request)
         except Refused as refusal:

@@ -7,6 +7,10 @@ and prove nothing to anybody.
 
 A question names the key by 3 bytes and has a number that counts up; its answer names neither, for it is bound to the
 question. Each direction has a key of its own, so nothing can be sent back to who said it.
+
+Two parts that both know the terse form leave out what the other one knows: the mark, a part of the key's name, and all
+of the number but its lowest byte. What is proven is the same, with what was left out: 8 bytes prove an answer, 7 go
+with a question about the map and 11 with a report.
 """
 
 from dataclasses import dataclass
@@ -26,6 +30,13 @@ BARE_MAC_BYTES: Final = 4
 """Of a question that anybody may ask."""
 MOST_COUNT: Final = (1 << 28) - 1
 """The largest number; then another key is agreed on."""
+TERSE: Final = 0xC000
+"""The two highest bits of a terse seal of a question or notice; no other attachment begins so. 14 bits of the key's
+name follow."""
+TERSE_BYTES: Final = 3
+"""Of a terse seal beside its proof."""
+LATE: Final = 64
+"""A number that is told by its lowest byte is one of the 256 from so many before the newest one on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +82,71 @@ class ShortSeal:
         sizes = (BARE_MAC_BYTES, MAC_BYTES) if what == "question" else (MAC_BYTES,)
         return cls(what, _mac_of_size(rest[size:], sizes), key_id, count)
 
+    def encode_terse(self) -> bytes:
+        """The attachment in the terse form; a refusal has none of its own."""
+        if self.what == "answer":
+            return self.mac
+        if self.what == "refusal":
+            return self.encode()
+        return (TERSE | terse_id(self.key_id)).to_bytes(2, "big") + bytes([self.count & 0xFF]) + self.mac
+
+
+@dataclass(frozen=True, slots=True)
+class TerseSeal:
+    """A question's or a notice's seal in the terse form, as it travels.
+
+    Attributes:
+        terse_id: 14 bits of the key's name; several keys may have the same.
+        low_count: lowest byte of the number.
+        mac: 4 or 8 bytes, of the seal in full.
+    """
+
+    terse_id: int
+    low_count: int
+    mac: bytes
+
+    @classmethod
+    def decode(cls, data: bytes) -> "TerseSeal":
+        """Reads an attachment.
+
+        Raises:
+            SealError: it is none of this form, or not whole.
+        """
+        if not is_terse(data):
+            raise SealError("no terse seal")
+        head, mac = data[:TERSE_BYTES], _mac_of_size(data[TERSE_BYTES:], (BARE_MAC_BYTES, MAC_BYTES))
+        return cls(int.from_bytes(head[:2], "big") & ~TERSE, head[2], mac)
+
+    def encode(self) -> bytes:
+        """The attachment."""
+        return (TERSE | self.terse_id).to_bytes(2, "big") + bytes([self.low_count]) + self.mac
+
+    def whole(self, what: ShortWhat, key_id: bytes, newest: int) -> ShortSeal:
+        """The seal in full, if it is under that key, whose newest number is known; its proof tells whether it is.
+
+        Raises:
+            SealError: there is no such number.
+        """
+        first = max(newest - LATE + 1, 1)
+        count = first + (self.low_count - first) % 256
+        if count > MOST_COUNT:
+            raise SealError(f"the number of a terse seal is {count}, expected 1 to {MOST_COUNT}")
+        return ShortSeal(what, self.mac, key_id, count)
+
+
+def terse_id(key_id: bytes) -> int:
+    """The 14 bits by which a terse seal names a key."""
+    return int.from_bytes(key_id[:2], "big") & ~TERSE
+
+
+def is_terse(attachment: bytes) -> bool:
+    """Whether an attachment begins as a terse seal of a question or a notice does."""
+    return bool(attachment) and attachment[0] >= TERSE >> 8
+
 
 def is_short(attachment: bytes) -> bool:
-    """Whether an attachment begins as a short seal does."""
-    return bool(attachment) and attachment[0] in _WHAT_OF
+    """Whether an attachment begins as a short seal does, in full or terse."""
+    return bool(attachment) and (attachment[0] in _WHAT_OF or is_terse(attachment))
 
 
 def mac_of(secret: bytes, seal: ShortSeal, key: str, payload: bytes, question: bytes, size: int) -> bytes:
@@ -88,13 +160,18 @@ def mac_of(secret: bytes, seal: ShortSeal, key: str, payload: bytes, question: b
         question: digest of the question that an answer is for; else empty.
         size: bytes of the proof.
     """
+    return mac_over(secret, seal, key, sha256(payload).digest(), question, size)
+
+
+def mac_over(secret: bytes, seal: ShortSeal, key: str, payload_sha: bytes, question: bytes, size: int) -> bytes:
+    """As `mac_of`, where the SHA-256 of the payload is known."""
     from cryptography.hazmat.primitives import hashes, hmac
 
     head, name = seal.head, key.encode()
     made = hmac.HMAC(secret, hashes.SHA256())
     for part in (b"gnd short seal 1", head, name, question):
         made.update(len(part).to_bytes(4, "little") + part)
-    made.update(sha256(payload).digest())
+    made.update(payload_sha)
     return made.finalize()[:size]
 
 

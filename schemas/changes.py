@@ -47,6 +47,7 @@ U8 = npt.NDArray[np.uint8]
 
 AckStatus = Literal["stored", "duplicate", "quarantined", "wanted", "resend"]
 _STATUS: Final[dict[int, AckStatus]] = {1: "stored", 2: "duplicate", 3: "quarantined", 4: "wanted", 5: "resend"}
+_MAY_BE_UNNAMED: Final = ("quarantined", "stored", "duplicate")
 _COUNTERS: Final = 4
 _LAST_CLASS: Final = int(max(ChangeClass))
 _ROUNDING: Final = 1e-5
@@ -341,7 +342,8 @@ class ChangeAck:
     """The merger's answer to a report. "stored" and "duplicate" are sent only when all of it is durable."""
 
     report_id: str
-    """The report that is answered; empty when it was too broken to have an id."""
+    """The report that is answered; empty when it was too broken to have an id, and where the seal of the answer shows
+    to which question it is one (`unnamed`)."""
     status: AckStatus
     reason: str = ""
     """Why it was quarantined or is to be sent again, in one line with numbers."""
@@ -351,7 +353,7 @@ class ChangeAck:
     """How far earlier reports of the vehicle have come that were patient."""
 
     def __post_init__(self) -> None:
-        if self.report_id or self.status != "quarantined":
+        if self.report_id or self.status not in _MAY_BE_UNNAMED:
             check_report_id(self.report_id)
         check_word(self.status, _STATUS, "ChangeAck status")
         check_text("reason", self.reason, REASON_PATTERN)
@@ -359,6 +361,10 @@ class ChangeAck:
         check_length("ChangeAck", len(self.told), limits.MAX_STATES_OF_ACK, "states of reports")
         if (self.status == "wanted") != bool(self.wanted):
             raise BadValue(f"ChangeAck {self.status} with a mask of {len(self.wanted)} bytes: one asks for the other")
+
+    def unnamed(self) -> "ChangeAck":
+        """Without the report's id, where it may be left out: 28 bytes less."""
+        return replace(self, report_id="") if self.status in _MAY_BE_UNNAMED else self
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeAck."""

@@ -13,7 +13,9 @@ MAX_TILE_REQUEST_BYTES: Final = 1 * KIB
 MAX_TILE_BODY_BYTES: Final = 4 * MIB
 MAX_TILE_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
 MAX_TILES_REQUEST_BYTES: Final = 24 * KIB
-MAX_TILES_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + 160 * KIB
+# One question is about up to four districts, which meet at a corner.
+MAX_OTHER_DISTRICTS: Final = 3
+MAX_TILES_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + (1 + MAX_OTHER_DISTRICTS) * 160 * KIB
 MAX_CATALOG_BYTES: Final = 128 * KIB
 MAX_CHANGE_REPORT_BYTES: Final = 8 * MIB
 MAX_PACKED_REPORT_BYTES: Final = 1 * MIB
@@ -28,6 +30,7 @@ MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
 
 # A district (q5/q10/q15) is 32 x 32 tiles.
 MAX_TILES_OF_DISTRICT: Final = 1024
+DISTRICTS: Final = 2**29
 # A published archive: an index takes some 20 bytes a tile, and its district has few packs.
 MAX_ARCHIVE_INDEX_BYTES: Final = 128 * KIB
 MAX_PACK_BYTES: Final = 16 * MIB

@@ -1,10 +1,10 @@
-"""Many tiles of one district in one query: what a client holds in half a byte a tile, the answer in a bit where it
-holds the newest already.
+"""Many tiles of a district, and of some others beside it, in one query: what a client holds in half a byte a tile, the
+answer in a bit where it holds the newest already.
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from typing import Final, Self
 
@@ -13,6 +13,16 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import limits
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import tiles_reply_pb2, tiles_request_pb2
+from gnd.schemas.other_tiles import (
+    HASH_BYTES,
+    TILES,
+    OtherTiles,
+    check_indices,
+    check_others,
+    n_held_of,
+    other_tiles,
+    step_between,
+)
 from gnd.schemas.ticket import TICKETS
 from gnd.schemas.tile_answer import (
     ANSWER_HASH_BYTES,
@@ -35,12 +45,14 @@ from gnd.schemas.wire import (
     serialise,
     word_of,
 )
+from gnd.schemas.wire_fields import submessages
 
 __all__ = [
     "ANSWER_HASH_BYTES",
     "EVERY_CODEC",
     "HASH_BYTES",
     "HeldVersion",
+    "OtherTiles",
     "TileAnswer",
     "TilesReply",
     "TilesRequest",
@@ -49,12 +61,9 @@ __all__ = [
     "tile_of_answer",
 ]
 
-HASH_BYTES: Final = 8
-"""So much of a hash, or of a digest of hashes, says what a client holds: chance errs once in 10^19."""
 EVERY_CODEC: Final = (4, 3, 2, 7, 6, 5, 1, 0)
 """What a request means that names no codecs; frozen, whatever later programs read besides."""
-MAX_HELD_VERSION: Final = 2**31
-TILES: Final = limits.MAX_TILES_OF_DISTRICT
+OTHERS_FIELD: Final = tiles_reply_pb2.TilesReply.OTHERS_FIELD_NUMBER
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +82,9 @@ class HeldVersion:
 
 @dataclass(frozen=True, slots=True)
 class TilesRequest:
-    """Which tiles of a district a client wants; `of` makes it from the tiles that it holds."""
+    """Which tiles of a district a client wants; `of` makes it from the tiles that it holds. `with_others` adds some of
+    other districts.
+    """
 
     wanted: tuple[tuple[int, int], ...]
     """(index in the district = lowest ten bits of the Morton code, version held, 0 = none), ascending."""
@@ -84,13 +95,15 @@ class TilesRequest:
     codecs: tuple[int, ...] = PREFERRED
     """In order of preference, at least one."""
     max_bytes: int = limits.MAX_TILE_BODY_BYTES
-    """Bodies beyond so many bytes wait for another request; the first always fits."""
+    """Bodies beyond so many bytes, over all districts, wait for another request; the first always fits."""
     near: int | None = None
     """Index of the tile around which tiles are needed first; None = in order."""
     ticket: int = 0
     """Of a vehicle (`ticket_of`): who gets a version that is on trial; 0 = no vehicle, which gets what is released."""
     newest: bool = False
     """The newest versions are wanted, released or not."""
+    others: tuple[OtherTiles, ...] = ()
+    """Tiles of other districts; a server answers for those that it has."""
 
     def __post_init__(self) -> None:
         check_indices(self.wanted)
@@ -102,11 +115,12 @@ class TilesRequest:
         if self.near is not None and not 0 <= self.near < TILES:
             raise BadValue(f"TilesRequest near tile {self.near}: a district has 0 .. {TILES - 1}")
         _check_held(self)
+        check_others(self.others)
 
     @property
     def n_held(self) -> int:
-        """Of how many tiles the client holds a version."""
-        return sum(version > 0 for _, version in self.wanted)
+        """Of how many tiles of the key's district the client holds a version."""
+        return n_held_of(self.wanted)
 
     @classmethod
     def of(
@@ -139,8 +153,34 @@ class TilesRequest:
             newest=newest,
         )
 
+    def with_others(self, district: District, others: Mapping[District, "TilesRequest"]) -> "TilesRequest":
+        """This request of a district, with those of others: their codecs and the like are taken from this one.
+
+        Raises:
+            BadValue: one of the others tells hashes, which needs a question of its own.
+        """
+        for other, one in others.items():
+            if one.held_hashes:
+                raise BadValue(f"TilesRequest with the hashes of what is held of another district, {other}")
+        return replace(
+            self,
+            others=tuple(
+                OtherTiles(step_between(district, other), one.wanted, one.held_digest) for other, one in others.items()
+            ),
+        )
+
+    def by_district(self, district: District) -> dict[District, "TilesRequest"]:
+        """A request a district, that of the key first; `BadValue` where another is none."""
+        alone = replace(self, others=())
+        found = {district: alone}
+        for one in self.others:
+            found[one.district(district)] = replace(
+                alone, wanted=one.wanted, held_digest=one.held_digest, held_hashes=(), near=None
+            )
+        return found
+
     def tiles(self, district: District) -> tuple[TileId, ...]:
-        """The tiles wanted, in the order of the answers."""
+        """The tiles wanted of the key's district, in the order of the answers."""
         return tuple(TileId(district.first_morton + index) for index, _ in self.wanted)
 
     def encode(self) -> bytes:
@@ -155,6 +195,7 @@ class TilesRequest:
             near=self.near,
             ticket=self.ticket,
             newest=self.newest,
+            others=(one.message() for one in self.others),
         )
         return serialise(message, limits.MAX_TILES_REQUEST_BYTES)
 
@@ -174,6 +215,7 @@ class TilesRequest:
             near=message.near if message.HasField("near") else None,
             ticket=message.ticket,
             newest=message.newest,
+            others=tuple(map(other_tiles, message.others)),
         )
 
 
@@ -185,20 +227,6 @@ def index_of(tile: TileId) -> int:
 def digest_of(shas: Iterable[bytes]) -> bytes:
     """First 8 bytes of SHA-256 over the hashes (32 bytes each) of what is held, in order."""
     return hashlib.sha256(b"".join(shas)).digest()[:HASH_BYTES]
-
-
-def check_indices(wanted: Sequence[tuple[int, int]]) -> None:
-    """`BadValue`, `TooLarge` unless these are (index, version) of tiles of one district, ascending."""
-    check_length("TilesRequest", len(wanted), TILES, "tiles")
-    if not wanted:
-        raise BadValue("TilesRequest for no tiles")
-    for index, version in wanted:
-        if not 0 <= version < MAX_HELD_VERSION:
-            raise BadValue(f"held version {version} of tile {index} is outside 0 .. {MAX_HELD_VERSION - 1}")
-    if wanted[0][0] < 0 or wanted[-1][0] >= TILES or any(a >= b for (a, _), (b, _) in pairwise(wanted)):
-        raise BadValue(
-            f"TilesRequest for tiles {[i for i, _ in wanted][:9]}…: ascending in 0 .. {TILES - 1}, once each"
-        )
 
 
 def _check_held(request: TilesRequest) -> None:
@@ -227,15 +255,20 @@ class TilesReply:
     answers: tuple[TileAnswer, ...]
     watched: tuple[int, ...] = ()
     """Places, ascending, of the answers about tiles of which a version is on trial."""
+    others: tuple["TilesReply | None", ...] = ()
+    """Of each other district of the request; None = this server does not answer for it. Empty: for none of them."""
 
     def __post_init__(self) -> None:
+        check_length("TilesReply", len(self.others), limits.MAX_OTHER_DISTRICTS, "other districts")
+        if any(one is not None and one.others for one in self.others):
+            raise BadValue("TilesReply about another district that is itself about others")
         check_length("TilesReply", len(self.answers), TILES, "tiles")
         watched = self.watched
         if watched and (watched[-1] >= len(self.answers) or any(a >= b for a, b in pairwise(watched))):
             raise BadValue(f"TilesReply watches places {watched[:9]}… of {len(self.answers)}: ascending, once each")
 
     def of_request(self, request: TilesRequest, district: District) -> list[tuple[TileId, TileAnswer]]:
-        """Each tile of the request with its answer.
+        """Each tile of the request in the key's district with its answer.
 
         Raises:
             BadValue: it answers more or fewer tiles than were asked for, or a delta where nothing is held.
@@ -246,6 +279,20 @@ class TilesReply:
             if version == 0 and answer.status in ("delta", "unchanged", "hash"):
                 raise BadValue(f"TilesReply says {answer.status!r} of tile {index}, of which nothing is held")
         return list(zip(request.tiles(district), self.answers, strict=True))
+
+    def by_district(self, request: TilesRequest, district: District) -> dict[District, "TilesReply"]:
+        """What is answered of each district of the request, that of the key first.
+
+        Raises:
+            BadValue: it answers more or fewer others than were asked for.
+        """
+        if len(self.others) not in (0, len(request.others)):
+            raise BadValue(f"TilesReply about {len(self.others)} other districts, asked for {len(request.others)}")
+        found = {district: replace(self, others=())}
+        for asked, one in zip(request.others, self.others, strict=False):
+            if one is not None:
+                found[asked.district(district)] = one
+        return found
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.TilesReply."""
@@ -260,6 +307,7 @@ class TilesReply:
             days=_days([answer.day for answer in brought]),
             watched=self.watched,
             signatures=signatures_message([answer.signature for answer in brought]),
+            others=(b"" if one is None else one.encode() for one in self.others),
         )
         return serialise(message, limits.MAX_TILES_REPLY_BYTES)
 
@@ -273,7 +321,17 @@ class TilesReply:
             max_fields=limits.MAX_TILES_REPLY_FIELDS,
         )
         check_major(message, "TilesReply")
-        return cls(tuple(_answers(message)), tuple(message.watched))
+        check_length("TilesReply", len(message.others), limits.MAX_OTHER_DISTRICTS, "other districts")
+        return cls(tuple(_answers(message)), tuple(message.watched), tuple(map(_other_reply, message.others)))
+
+
+def _other_reply(data: bytes) -> TilesReply | None:
+    """The answer about another district: none where it is empty, and about no others of its own."""
+    if not data:
+        return None
+    if any(True for _ in submessages("TilesReply", data, OTHERS_FIELD)):  # before they are read, however deep
+        raise BadValue("TilesReply about another district that is itself about others")
+    return TilesReply.decode(data)
 
 
 def _days(days: Sequence[int]) -> Sequence[int]:

@@ -1,10 +1,16 @@
-"""One question about tiles of one district and its answer: verified, handed to a holder, booked tile by tile."""
+"""One question about tiles and its answer: verified, handed to a holder, booked tile by tile.
+
+Tiles of several districts go into one question, on the key of the first. A server that does not know that answers for
+the first district alone, as one does that has not the others: those are to be asked for one by one, for a while.
+"""
 
 import logging
+import threading
+import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Generic, Literal, Protocol, cast
+from typing import Final, Generic, Literal, Protocol, cast
 
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.ledger import Share
@@ -14,6 +20,7 @@ from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.errors import SchemaError, WrongHash
 from gnd.schemas.keys import batch_key
+from gnd.schemas.limits import MAX_OTHER_DISTRICTS
 from gnd.schemas.tile_answer import content_of_answer
 from gnd.schemas.tiles import TileBlob
 from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
@@ -22,6 +29,9 @@ from gnd.tile_client.checking import VersionCheck
 Head = tuple[int, bytes]
 """Version and sha of a tile that is held."""
 NOTHING: Head = (0, b"")
+ALONE_S: Final = 600.0
+"""A district that was not answered along with another one is asked for alone for so long."""
+MOST_ALONE: Final = 256
 
 _log = logging.getLogger(__name__)
 
@@ -87,6 +97,8 @@ class ExchangeOutcome(Generic[TileT]):
     fetched: list[Fetched[TileT]] = field(default_factory=list)
     later: list[TileId] = field(default_factory=list)
     """Did not fit into the answer: ask again."""
+    unanswered: list[TileId] = field(default_factory=list)
+    """Of districts that do not go along with the first one: ask for each district alone."""
     wrong: dict[TileId, str] = field(default_factory=dict)
     """The content was not what its hash says, or nobody answers for it: ask for the whole tile."""
     body_bytes: dict[TileId, int] = field(default_factory=dict)
@@ -96,7 +108,7 @@ class ExchangeOutcome(Generic[TileT]):
 
 
 class Exchange(Generic[TileT]):
-    """Asks for several tiles of one district at once, in the layer of the holder. Thread-safe where the holder is.
+    """Asks for several tiles at once, in the layer of the holder. Thread-safe where the holder is.
 
     Args:
         bus: an open bus.
@@ -123,18 +135,29 @@ class Exchange(Generic[TileT]):
         self._ticket, self._wants_newest = ticket, newest
         self._bus, self._holder, self._timeout_s = bus, holder, timeout_s
         self._retry = RetryPolicy(attempt_timeout_s=attempt_s)
+        self._alone_until_s: dict[District, float] = {}
+        self._lock = threading.Lock()
         self._kind = cast("type[TileT]", kind_of_layer(holder.layer))
+
+    def goes_along(self, districts: Collection[District], other: District) -> bool:
+        """Whether tiles of another district may go into a question about these."""
+        if other in districts or not districts:
+            return True
+        if len(districts) > MAX_OTHER_DISTRICTS:
+            return False
+        with self._lock:
+            return self._alone_until_s.get(other, 0.0) <= time.monotonic()
 
     def ask(
         self, tiles: Sequence[TileId], whole: Collection[TileId], max_bytes: int, near: TileId | None = None
     ) -> ExchangeOutcome[TileT]:
-        """Ask for tiles of one district.
+        """Ask for tiles of one district, or of some that go along with that of the first tile (`goes_along`).
 
         Args:
             tiles: which, at least one.
             whole: those of them that are asked for as if nothing were held.
             max_bytes: bodies beyond so many bytes wait for a later question; the first always fits.
-            near: the tiles around this one come first; None = in the order of their ids.
+            near: a tile of the first one's district: the tiles around it come first; None = in the order of their ids.
 
         Raises:
             BusError: no answer before the deadline.
@@ -143,13 +166,22 @@ class Exchange(Generic[TileT]):
         held = self._held(t for t in tiles if t not in whole)
         outcome = ExchangeOutcome[TileT]()
         answers = self._answers(tiles, held, max_bytes, near, outcome)
-        unclear = [t for t in tiles if answers[t].status == "hash"]
-        if unclear:
-            near = None if near is None else unclear[0]
-            answers |= self._answers(unclear, held, max_bytes, near, outcome, with_hashes=True)
-        for tile_id in tiles:
+        outcome.unanswered = [t for t in tiles if t not in answers]
+        self._note_alone(_by_district(outcome.unanswered))
+        for some in _by_district(t for t, answer in answers.items() if answer.status == "hash").values():
+            beside = None if near is None else some[0]
+            answers |= self._answers(some, held, max_bytes, beside, outcome, with_hashes=True)
+        for tile_id in (t for t in tiles if t in answers):
             self._take(tile_id, answers[tile_id], held.get(tile_id, NOTHING), outcome)
         return outcome
+
+    def _note_alone(self, districts: Collection[District]) -> None:
+        """These were not answered along with another one."""
+        now_s = time.monotonic()
+        with self._lock:
+            self._alone_until_s |= dict.fromkeys(districts, now_s + ALONE_S)
+            for one in list(self._alone_until_s)[:-MOST_ALONE]:
+                del self._alone_until_s[one]
 
     def _held(self, tiles: Iterable[TileId]) -> Mapping[TileId, Head]:
         """A cache that cannot be read holds nothing."""
@@ -169,18 +201,21 @@ class Exchange(Generic[TileT]):
         *,
         with_hashes: bool = False,
     ) -> dict[TileId, TileAnswer]:
+        """The answers to one question, on the key of the first tile's district; those of others may be missing."""
         layer, district = self._holder.layer, tiles[0].district
-        wanted = [HeldVersion(t, *held.get(t, NOTHING)) for t in tiles]
-        codecs = codecs_of_layer(layer)
-        request = TilesRequest.of(
-            wanted,
-            codecs=codecs,
-            max_bytes=max_bytes,
-            near=near,
-            with_hashes=with_hashes,
-            ticket=self._ticket,
-            newest=self._wants_newest,
-        )
+        requests = {
+            one: TilesRequest.of(
+                [HeldVersion(t, *held.get(t, NOTHING)) for t in some],
+                codecs=codecs_of_layer(layer),
+                max_bytes=max_bytes,
+                near=near if one == district else None,
+                with_hashes=with_hashes,
+                ticket=self._ticket,
+                newest=self._wants_newest,
+            )
+            for one, some in _by_district(tiles).items()
+        }
+        request = requests.pop(district).with_others(district, requests)
         payload = self._bus.request(
             batch_key(layer, district),
             request.encode(),
@@ -189,10 +224,11 @@ class Exchange(Generic[TileT]):
             timeout_s=self._timeout_s,
             shares_of=partial(shares_of, request, district),
         )
-        reply = TilesReply.decode(payload)
-        answers = reply.of_request(request, district)
-        outcome.watched.update(answers[place][0] for place in reply.watched)
-        return dict(answers)
+        found: dict[TileId, TileAnswer] = {}
+        for reply, answers in _answered(request, district, payload):
+            outcome.watched.update(answers[place][0] for place in reply.watched)
+            found |= dict(answers)
+        return found
 
     def _take(self, tile_id: TileId, answer: TileAnswer, held: Head, outcome: ExchangeOutcome[TileT]) -> None:
         if answer.status in ("later", "hash"):
@@ -258,9 +294,28 @@ def shares_of(request: TilesRequest, district: District, payload: bytes) -> list
     An answer that cannot be read has no shares: it is booked whole.
     """
     try:
-        answers = TilesReply.decode(payload).of_request(request, district)
+        answers = [one for _, some in _answered(request, district, payload) for one in some]
     except SchemaError:
         return []
     kinds = {"blob": "tile", "delta": "delta"}
     bodies = [Share(kinds[a.status], len(a.body) + len(a.sha), tile_id) for tile_id, a in answers if a.status in kinds]
     return [Share("tile", len(payload) - sum(share.app_bytes for share in bodies)), *bodies]
+
+
+def _answered(
+    request: TilesRequest, district: District, payload: bytes
+) -> list[tuple[TilesReply, list[tuple[TileId, TileAnswer]]]]:
+    """The reply about each district that is answered, and what it says of each tile; `SchemaError` where it is none to
+    the request.
+    """
+    asked = request.by_district(district)
+    replies = TilesReply.decode(payload).by_district(request, district)
+    return [(reply, reply.of_request(asked[one], one)) for one, reply in replies.items()]
+
+
+def _by_district(tiles: Iterable[TileId]) -> dict[District, list[TileId]]:
+    """Tiles by their district, in the order in which the districts come first."""
+    found: dict[District, list[TileId]] = {}
+    for tile in tiles:
+        found.setdefault(tile.district, []).append(tile)
+    return found

@@ -6,8 +6,8 @@ whose base is gone or damaged, is not sent; tiles of plain floats have none. Fea
 """
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, Literal
 from zlib import crc32
@@ -23,7 +23,7 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.limits import MAX_TILE_BODY_BYTES
 from gnd.schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, as_kind
-from gnd.schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
+from gnd.schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of
 from gnd.tile_store.errors import StoreDamaged
 from gnd.tile_store.memory import Memory
 from gnd.tile_store.released import heads_for
@@ -45,6 +45,39 @@ class _Sent:
     status: Literal["blob", "delta"]
     codec_id: int
     body: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What is answered of one district.
+
+    Attributes:
+        heads: the newest version of each tile for who asks.
+        held: see `TileAnswers._held`.
+        on_trial: tiles of which a version is on trial.
+        answers: of each tile that is asked for, in order; filled while there is room.
+        is_of_vehicle: whether a vehicle asks.
+    """
+
+    heads: Mapping[TileId, CatalogEntry]
+    held: Mapping[TileId, bytes | None]
+    on_trial: frozenset[TileId]
+    answers: dict[TileId, TileAnswer]
+    is_of_vehicle: bool
+
+    @property
+    def wanting(self) -> list[TileId]:
+        """Tiles whose body is to be sent."""
+        return [tile for tile, answer in self.answers.items() if answer.status == "later"]
+
+    def version_of(self, tile: TileId) -> int | None:
+        """Which version is sent; None: the newest."""
+        return self.heads[tile].version if tile in self.on_trial else None
+
+    def reply(self) -> TilesReply:
+        """As it goes out."""
+        watched = (place for place, tile in enumerate(self.answers) if tile in self.on_trial)
+        return TilesReply(tuple(self.answers.values()), tuple(watched) if self.is_of_vehicle else ())
 
 
 class TileAnswers:
@@ -70,39 +103,48 @@ class TileAnswers:
         blob = TileBlob(stored.tile, stored.version, stored.sha, sent.codec_id, sent.body, stored.day)
         return TileReply("blob", blob, signature=stored.signature)
 
-    def many(self, layer: str, district: District, request: TilesRequest) -> TilesReply:
-        """The answers about tiles of a district, those around `request.near` first while bytes are left.
+    def many(
+        self, layer: str, district: District, request: TilesRequest, others: Collection[District] = ()
+    ) -> TilesReply:
+        """The answers about tiles of a district, and of those `others` that the request names, too. Those around
+        `request.near` come first while bytes are left.
 
         A tile whose body is damaged is "later", so that it does not keep the others; alone it is an error.
 
         Raises:
             Refused: a tile cannot be written in a codec that the client reads.
             StoreError: the store has failed, or nothing but damaged bodies is left to send.
-            SchemaError: nothing but bodies that cannot be decoded is left to send.
+            SchemaError: nothing but bodies that cannot be decoded is left to send, or there is no such district.
         """
+        asked = request.by_district(district)
+        parts = {one: self._part(layer, one, part) for one, part in asked.items() if one == district or one in others}
+        wanting = [(tile, part) for part in parts.values() for tile in part.wanting]
+        left, damaged = request.max_bytes, list[GndError]()
+        for tile, part in _nearest_first(wanting, district, request.near):
+            if left <= 0:
+                break
+            try:
+                answer = self._answer(layer, tile, part.version_of(tile), part.held[tile] or b"", request.codecs)
+            except (SchemaError, CodecError, StoreDamaged) as error:
+                _LOG.error("tile %s cannot be sent: %s", tile, error)
+                damaged.append(error)
+                continue
+            left, part.answers[tile] = _within(left, request.max_bytes, answer)
+        if damaged and left == request.max_bytes:
+            raise damaged[0]
+        of_district, *of_others = (parts[one].reply() if one in parts else None for one in asked)
+        assert of_district is not None
+        return replace(of_district, others=tuple(of_others))
+
+    def _part(self, layer: str, district: District, request: TilesRequest) -> "_Part":
+        """What can be said of a district without any body."""
         tiles = request.tiles(district)
         newest = {entry.tile: entry for entry in self._store.heads(layer, district.path)}
         trials = self._store.trials(layer, district.path)
         held = self._held(layer, district, request, newest)
         heads = heads_for(request, newest, trials, held) if trials else newest
         answers = {tile: _without_body(heads.get(tile), held[tile]) for tile in tiles}
-        wanting = [tile for tile in tiles if answers[tile].status == "later"]
-        left, damaged = request.max_bytes, list[GndError]()
-        for tile in _nearest_first(wanting, district, request.near):
-            if left <= 0:
-                break
-            try:
-                version = heads[tile].version if tile in trials else None
-                answer = self._answer(layer, tile, version, held[tile] or b"", request.codecs)
-            except (SchemaError, CodecError, StoreDamaged) as error:
-                _LOG.error("tile %s cannot be sent: %s", tile, error)
-                damaged.append(error)
-                continue
-            left, answers[tile] = _within(left, request.max_bytes, answer)
-        if damaged and left == request.max_bytes:
-            raise damaged[0]
-        watched = (place for place, tile in enumerate(tiles) if tile in trials) if request.ticket else ()
-        return TilesReply(tuple(answers.values()), tuple(watched))
+        return _Part(heads, held, frozenset(trials), answers, is_of_vehicle=request.ticket > 0)
 
     def _answer(
         self, layer: str, tile: TileId, version: int | None, held: bytes, codecs: tuple[int, ...]
@@ -284,13 +326,15 @@ def _without_body(head: CatalogEntry | None, held: bytes | None) -> TileAnswer:
     return TileAnswer("unchanged" if held == head.sha else "later")
 
 
-def _nearest_first(tiles: Sequence[TileId], district: District, near: int | None) -> list[TileId]:
-    """The tiles by their distance from the one with index `near`; in order without one."""
+def _nearest_first(
+    tiles: list[tuple[TileId, _Part]], district: District, near: int | None
+) -> list[tuple[TileId, _Part]]:
+    """The tiles by their distance from the one of the district with index `near`; in order without one."""
     if near is None:
-        return list(tiles)
+        return tiles
     centre = TileId(district.first_morton + near)
     lon, lat = centre.lon_index, centre.lat_index
-    return sorted(tiles, key=lambda t: ((t.lon_index - lon) ** 2 + (t.lat_index - lat) ** 2, index_of(t)))
+    return sorted(tiles, key=lambda one: ((one[0].lon_index - lon) ** 2 + (one[0].lat_index - lat) ** 2, one[0].morton))
 
 
 def _within(left: int, limit: int, answer: TileAnswer) -> tuple[int, TileAnswer]:

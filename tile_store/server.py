@@ -8,6 +8,7 @@ reads, it reads between two looks at who owns the district: while a district mov
 import logging
 import threading
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
 from itertools import groupby
 from typing import Final, Self
 
@@ -208,13 +209,24 @@ class TileServer:
         return self._region(found, region.prefix, wanted)
 
     def batch(self, request: Request) -> Answer:
-        """Reply about several tiles of one district."""
+        """Reply about several tiles of a district, and of those others of the request that the store owns, too."""
         try:
             layer, district = keys.parse_batch_key(request.key)
             wanted = TilesRequest.decode(request.payload)
         except SchemaError as error:
             raise _refusal(request, error) from None
-        return self._of_owned(district, lambda: self._answers.many(layer, district, wanted).encode())
+        return self._of_owned(district, lambda: self._batch(request, layer, district, wanted))
+
+    def _batch(self, request: Request, layer: str, district: District, wanted: TilesRequest) -> bytes:
+        try:
+            others = [one for one in wanted.by_district(district) if one != district]
+        except SchemaError as error:
+            raise _refusal(request, error) from None
+        owned = list(filter(self._is_owned, others))
+        reply = self._answers.many(layer, district, wanted, owned)
+        told = zip(others, reply.others, strict=True)  # some may have moved meanwhile
+        still = (answer if answer is not None and self._is_owned(one) else None for one, answer in told)
+        return replace(reply, others=tuple(still)).encode()
 
     def catalogs(self, request: Request) -> Answer:
         """The catalog of an exact key's district (it may be empty), or of each district with tiles in a region."""

@@ -70,7 +70,10 @@ class ChangeAck(_message.Message):
     major: _builtins.int
     """Major version of this message; always 1."""
     report_id: _builtins.str
-    """The report that is answered: ULID, 26 characters; empty when the report was too broken to have one."""
+    """The report that is answered: ULID, 26 characters; empty when the report was too broken to have one. Also
+    empty with status 1 to 3 where the question came under a key that has terse seals (fleet_bus/short_seals.py): then
+    the answer's seal shows that it is one to that report.
+    """
     status: Global___ChangeAck.Status.ValueType
     reason: _builtins.str
     """Why it was quarantined or is to be sent again, in one line with numbers; otherwise empty."""

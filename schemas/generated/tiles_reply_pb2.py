@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from . import version_signatures_pb2 as gnd_dot_v1_dot_version__signatures__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18gnd/v1/tiles_reply.proto\x12\x06gnd.v1\x1a\x1fgnd/v1/version_signatures.proto\"\xcb\x02\n\nTilesReply\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0c\n\x04runs\x18\x02 \x03(\r\x12\x10\n\x08versions\x18\x03 \x03(\r\x12\x0e\n\x06hashes\x18\x04 \x01(\x0c\x12\x0e\n\x06\x63odecs\x18\x05 \x03(\r\x12\x0e\n\x06\x62odies\x18\x06 \x03(\x0c\x12\x0c\n\x04\x64\x61ys\x18\x07 \x03(\r\x12\x0f\n\x07watched\x18\x08 \x03(\r\x12-\n\nsignatures\x18\t \x01(\x0b\x32\x19.gnd.v1.VersionSignatures\"\x8f\x01\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x0f\n\x0bSTATUS_BLOB\x10\x01\x12\x10\n\x0cSTATUS_DELTA\x10\x02\x12\x14\n\x10STATUS_UNCHANGED\x10\x03\x12\x11\n\rSTATUS_ABSENT\x10\x04\x12\x10\n\x0cSTATUS_LATER\x10\x05\x12\x0f\n\x0bSTATUS_HASH\x10\x06\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18gnd/v1/tiles_reply.proto\x12\x06gnd.v1\x1a\x1fgnd/v1/version_signatures.proto\"\xdb\x02\n\nTilesReply\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0c\n\x04runs\x18\x02 \x03(\r\x12\x10\n\x08versions\x18\x03 \x03(\r\x12\x0e\n\x06hashes\x18\x04 \x01(\x0c\x12\x0e\n\x06\x63odecs\x18\x05 \x03(\r\x12\x0e\n\x06\x62odies\x18\x06 \x03(\x0c\x12\x0c\n\x04\x64\x61ys\x18\x07 \x03(\r\x12\x0f\n\x07watched\x18\x08 \x03(\r\x12-\n\nsignatures\x18\t \x01(\x0b\x32\x19.gnd.v1.VersionSignatures\x12\x0e\n\x06others\x18\n \x03(\x0c\"\x8f\x01\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x0f\n\x0bSTATUS_BLOB\x10\x01\x12\x10\n\x0cSTATUS_DELTA\x10\x02\x12\x14\n\x10STATUS_UNCHANGED\x10\x03\x12\x11\n\rSTATUS_ABSENT\x10\x04\x12\x10\n\x0cSTATUS_LATER\x10\x05\x12\x0f\n\x0bSTATUS_HASH\x10\x06\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,7 +33,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.tiles
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_TILESREPLY']._serialized_start=70
-  _globals['_TILESREPLY']._serialized_end=401
-  _globals['_TILESREPLY_STATUS']._serialized_start=258
-  _globals['_TILESREPLY_STATUS']._serialized_end=401
+  _globals['_TILESREPLY']._serialized_end=417
+  _globals['_TILESREPLY_STATUS']._serialized_start=274
+  _globals['_TILESREPLY_STATUS']._serialized_end=417
 # @@protoc_insertion_point(module_scope)

@@ -72,6 +72,7 @@ class TilesReply(_message.Message):
     DAYS_FIELD_NUMBER: _builtins.int
     WATCHED_FIELD_NUMBER: _builtins.int
     SIGNATURES_FIELD_NUMBER: _builtins.int
+    OTHERS_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     hashes: _builtins.bytes
@@ -110,6 +111,12 @@ class TilesReply(_message.Message):
     def signatures(self) -> _version_signatures_pb2.VersionSignatures:
         """Who answers for each blob and delta, in order; missing = none is signed."""
 
+    @_builtins.property
+    def others(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bytes]:
+        """Of each of the request's `others`, in order, a TilesReply without any itself; an empty one = this server does not
+        answer for that district: ask alone. Missing = for none of them.
+        """
+
     def __init__(
         self,
         *,
@@ -122,10 +129,11 @@ class TilesReply(_message.Message):
         days: _abc.Iterable[_builtins.int] | None = ...,
         watched: _abc.Iterable[_builtins.int] | None = ...,
         signatures: _version_signatures_pb2.VersionSignatures | None = ...,
+        others: _abc.Iterable[_builtins.bytes] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["signatures", b"signatures"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "days", b"days", "hashes", b"hashes", "major", b"major", "runs", b"runs", "signatures", b"signatures", "versions", b"versions", "watched", b"watched"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "days", b"days", "hashes", b"hashes", "major", b"major", "others", b"others", "runs", b"runs", "signatures", b"signatures", "versions", b"versions", "watched", b"watched"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -22,15 +22,16 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from . import other_tiles_pb2 as gnd_dot_v1_dot_other__tiles__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/tiles_request.proto\x12\x06gnd.v1\"\xb6\x01\n\x0cTilesRequest\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0e\n\x06wanted\x18\x02 \x01(\x0c\x12\x13\n\x0bheld_digest\x18\x03 \x01(\x0c\x12\x13\n\x0bheld_hashes\x18\x04 \x01(\x0c\x12\x0e\n\x06\x63odecs\x18\x05 \x03(\r\x12\x11\n\tmax_bytes\x18\x06 \x01(\r\x12\x11\n\x04near\x18\x07 \x01(\rH\x00\x88\x01\x01\x12\x0e\n\x06ticket\x18\x08 \x01(\r\x12\x0e\n\x06newest\x18\t \x01(\x08\x42\x07\n\x05_nearb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/tiles_request.proto\x12\x06gnd.v1\x1a\x18gnd/v1/other_tiles.proto\"\xda\x01\n\x0cTilesRequest\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0e\n\x06wanted\x18\x02 \x01(\x0c\x12\x13\n\x0bheld_digest\x18\x03 \x01(\x0c\x12\x13\n\x0bheld_hashes\x18\x04 \x01(\x0c\x12\x0e\n\x06\x63odecs\x18\x05 \x03(\r\x12\x11\n\tmax_bytes\x18\x06 \x01(\r\x12\x11\n\x04near\x18\x07 \x01(\rH\x00\x88\x01\x01\x12\x0e\n\x06ticket\x18\x08 \x01(\r\x12\x0e\n\x06newest\x18\t \x01(\x08\x12\"\n\x06others\x18\n \x03(\x0b\x32\x12.gnd.v1.OtherTilesB\x07\n\x05_nearb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.tiles_request_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_TILESREQUEST']._serialized_start=39
-  _globals['_TILESREQUEST']._serialized_end=221
+  _globals['_TILESREQUEST']._serialized_start=65
+  _globals['_TILESREQUEST']._serialized_end=283
 # @@protoc_insertion_point(module_scope)

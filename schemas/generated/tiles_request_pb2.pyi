@@ -4,6 +4,7 @@ isort:skip_file
 """
 
 from collections import abc as _abc
+from . import other_tiles_pb2 as _other_tiles_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -20,7 +21,9 @@ DESCRIPTOR: _descriptor.FileDescriptor
 
 @_typing.final
 class TilesRequest(_message.Message):
-    """What a client asks of the tile server on gnd/v1/tiles/<layer>/<q5>/<q10>/<q15>: tiles of one district, together."""
+    """What a client asks of the tile server on gnd/v1/tiles/<layer>/<q5>/<q10>/<q15>: tiles of one district, together,
+    and of some others beside it.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -33,6 +36,7 @@ class TilesRequest(_message.Message):
     NEAR_FIELD_NUMBER: _builtins.int
     TICKET_FIELD_NUMBER: _builtins.int
     NEWEST_FIELD_NUMBER: _builtins.int
+    OTHERS_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     wanted: _builtins.bytes
@@ -48,11 +52,12 @@ class TilesRequest(_message.Message):
     has asked for them.
     """
     max_bytes: _builtins.int
-    """Bodies beyond so many bytes wait for another request; 0 = as many as a reply holds. The first body always fits.
+    """Bodies beyond so many bytes, over all districts, wait for another request; 0 = as many as a reply holds. The first
+    body always fits.
     [bytes]
     """
     near: _builtins.int
-    """Index of the tile whose surroundings are needed first, should not all fit."""
+    """Index in the key's district of the tile whose surroundings are needed first, should not all fit."""
     ticket: _builtins.int
     """Where versions are released in stages: a number of the vehicle that chooses, by tile, whether it is among the first
     to get a new one (schemas/ticket.py); 0 = the client is no vehicle, and gets what is released. [1 .. 65536]
@@ -62,6 +67,12 @@ class TilesRequest(_message.Message):
     @_builtins.property
     def codecs(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """Codec ids that the client can read, in order of preference; empty = all of 0 to 7, the range coded first."""
+
+    @_builtins.property
+    def others(self) -> _containers.RepeatedCompositeFieldContainer[_other_tiles_pb2.OtherTiles]:
+        """Tiles of other districts that the client wants, too; no district twice, at most 3. A server that does not know this
+        field answers for the key's district alone.
+        """
 
     def __init__(
         self,
@@ -75,10 +86,11 @@ class TilesRequest(_message.Message):
         near: _builtins.int | None = ...,
         ticket: _builtins.int = ...,
         newest: _builtins.bool = ...,
+        others: _abc.Iterable[_other_tiles_pb2.OtherTiles] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "near", b"near"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "codecs", b"codecs", "held_digest", b"held_digest", "held_hashes", b"held_hashes", "major", b"major", "max_bytes", b"max_bytes", "near", b"near", "newest", b"newest", "ticket", b"ticket", "wanted", b"wanted"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "codecs", b"codecs", "held_digest", b"held_digest", "held_hashes", b"held_hashes", "major", b"major", "max_bytes", b"max_bytes", "near", b"near", "newest", b"newest", "others", b"others", "ticket", b"ticket", "wanted", b"wanted"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__near: _TypeAlias = _typing.Literal["near"]  # noqa: Y015
     _WhichOneofArgType__near: _TypeAlias = _typing.Literal["_near", b"_near"]  # noqa: Y015

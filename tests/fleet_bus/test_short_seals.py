@@ -21,6 +21,7 @@ from gnd.fleet_bus.agreed_keys import (
     HeldKeys,
     KeyHalf,
     ReplayWindow,
+    under_terse,
 )
 from gnd.fleet_bus.errors import SealError
 from gnd.fleet_bus.identity.authority import Authority
@@ -28,7 +29,7 @@ from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.remembered import FILE, RememberedChains
 from gnd.fleet_bus.seal_keys import load_authority, load_signer
 from gnd.fleet_bus.seals import Holder, Seal, question_digest
-from gnd.fleet_bus.short_seals import MOST_COUNT, ShortSeal, is_short
+from gnd.fleet_bus.short_seals import LATE, MOST_COUNT, ShortSeal, TerseSeal, is_short, terse_id
 
 KEY, ANSWERED_ON = "gnd/v1/change/ndt/13033/03021/12301", "gnd/v1/tiles/ndt/13033/03021/12301"
 PUBLIC = ec.derive_private_key(7, ec.SECP256R1()).public_key()
@@ -36,14 +37,24 @@ SHARD = Holder("shard", "s1", "owner", b"shard-id", 4e9, PUBLIC)
 VEHICLE = Holder("vehicle", "v1", "owner", b"vehic-id", 4e9, PUBLIC)
 
 
-def half(byte: int) -> KeyHalf:
+GOLDEN_TERSE = {
+    "report": "eac8017a610a5db5109a6f",
+    "question": "eac8025cbd5c2b",
+    "answer": "ef311a42fd7db684",
+    "refusal": "b37f51b19778402c40",
+    "notice": "eac801da12e44ee30092db",
+}
+
+
+def half(byte: int, *, knows_terse: bool = False) -> KeyHalf:
     secret = X25519PrivateKey.from_private_bytes(bytes([byte]) * 32)
-    return KeyHalf(secret, secret.public_key().public_bytes_raw())
+    share = secret.public_key().public_bytes_raw()
+    return KeyHalf(secret, share[:-1] + bytes([share[-1] | (0x80 if knows_terse else 0)]))
 
 
-def both(asks: Holder | None = VEHICLE) -> tuple[AgreedKey, AgreedKey]:
+def both(asks: Holder | None = VEHICLE, knows: tuple[bool, bool] = (False, False)) -> tuple[AgreedKey, AgreedKey]:
     """The same key at the side that asks and at the side that answers, always the same."""
-    ours, theirs, digest = half(1), half(2), bytes(32)
+    ours, theirs, digest = half(1, knows_terse=knows[0]), half(2, knows_terse=knows[1]), bytes(32)
     asker = ours.agree(theirs.share, digest, SHARD, asks, is_asker=True)
     return asker, theirs.agree(ours.share, digest, SHARD, asks, is_asker=False)
 
@@ -76,6 +87,43 @@ def test_whatever_is_read_has_one_form(data: bytes) -> None:
     assert seal.encode() == data
 
 
+@given(
+    data=st.one_of(st.binary(max_size=12), st.binary(max_size=11).map(lambda tail: b"\xc3" + tail)),
+    newest=st.integers(0, MOST_COUNT),
+)
+def test_a_terse_seal_has_one_form_and_is_no_other(data: bytes, newest: int) -> None:
+    try:
+        seal = TerseSeal.decode(data)
+    except SealError:
+        return
+    assert seal.encode() == data
+    assert is_short(data)
+    for other in (ShortSeal, Seal):
+        with pytest.raises(SealError):
+            other.decode(data)
+    whole = whole_of(seal, "question", newest)
+    if whole is not None:
+        assert TerseSeal.decode(whole.encode_terse()) == seal
+
+
+def whole_of(seal: TerseSeal, what, newest: int) -> ShortSeal | None:
+    try:
+        return seal.whole(what, seal.terse_id.to_bytes(2, "big") + b"x", newest)
+    except SealError:
+        assert newest > MOST_COUNT - 256
+        return None
+
+
+@given(newest=st.integers(0, MOST_COUNT - 256), ahead=st.integers(1 - LATE, 256 - LATE))
+def test_a_number_is_found_by_its_lowest_byte(newest: int, ahead: int) -> None:
+    """As long as it is no more late, or ahead, than one byte tells."""
+    count = newest + ahead
+    if count < 1:
+        return
+    sent = ShortSeal("notice", bytes(8), b"abc", count)
+    assert TerseSeal.decode(sent.encode_terse()).whole("notice", b"abc", newest) == sent
+
+
 @pytest.mark.parametrize("count", [0, -1, MOST_COUNT + 1])
 def test_a_number_out_of_bounds_is_not_written(count: int) -> None:
     with pytest.raises(SealError, match="expected 1 to"):
@@ -101,6 +149,63 @@ def test_golden_bytes() -> None:
     assert answers.answer(KEY, b"no", digest, refusal=True).encode().hex() == "b3bcd7b205ffe8fcb1"
     assert answers.notice("gnd/v1/want/v1", b"released").encode().hex() == "b444a59501b32a2cd9ff918c5d"
     assert digest.hex() == "10e002edd3bdf0c0ae159e3a6c7a81dd8c2f3e3deda15da68750bda07700183e"
+
+
+def test_golden_bytes_of_terse_seals() -> None:
+    """The same proofs, and less beside them; an answer is its proof alone."""
+    asker, answers = both(knows=(True, True))
+    question = asker.question(KEY, b"report", is_bare=False)
+    digest = question_digest(KEY, b"report", question.head)
+    made = {
+        "report": asker.written(question),
+        "question": asker.written(asker.question(ANSWERED_ON, b"which", is_bare=True)),
+        "answer": answers.written(answers.answer(KEY, b"true", digest, refusal=False)),
+        "refusal": answers.written(answers.answer(KEY, b"no", digest, refusal=True)),
+        "notice": answers.written(answers.notice("gnd/v1/want/v1", b"released")),
+    }
+    assert {what: data.hex() for what, data in made.items()} == GOLDEN_TERSE
+    assert [len(data) for data in made.values()] == [11, 7, 8, 9, 11]
+    assert question.encode()[-8:] == made["report"][-8:]
+
+
+@pytest.mark.parametrize("knows", [(True, False), (False, True), (False, False)])
+def test_a_part_of_an_older_release_gets_whole_seals(knows: tuple[bool, bool]) -> None:
+    asker, answers = both(knows=knows)
+    assert not asker.is_terse
+    assert not answers.is_terse
+    assert asker.key_id == answers.key_id
+    seal = asker.question(KEY, b"report", is_bare=False)
+    assert asker.written(seal) == seal.encode()
+    answers.check_question(ShortSeal.decode(asker.written(seal)), KEY, b"report", 0, is_bare=False)
+    assert KeyHalf.make().share[-1] & 0x80, "an older one leaves it 0, and does not look"
+
+
+def test_the_mark_in_a_half_changes_the_name_of_the_key_and_not_its_secret() -> None:
+    """X25519 ignores the highest bit (RFC 7748); all else that follows is made over the halves as they were sent."""
+    ours, theirs = half(1), half(2)
+    marked = theirs.share[:-1] + bytes([theirs.share[-1] | 0x80])
+    shares = [ours.secret.exchange(X25519PublicKey.from_public_bytes(one)) for one in (theirs.share, marked)]
+    assert shares[0] == shares[1]
+    assert both()[0].key_id != both(knows=(True, True))[0].key_id
+
+
+def test_keys_of_the_same_terse_name_are_told_apart() -> None:
+    granted, askers = GrantedKeys(), []
+    for number in range(300):
+        ours, digest = KeyHalf.make(), number.to_bytes(32, "big")
+        share = granted.grant(ours.share, digest, SHARD, replace(VEHICLE, name=f"w{number}"))
+        askers.append(ours.agree(share, digest, SHARD, replace(VEHICLE, name=f"w{number}"), is_asker=True))
+    one, other = askers[7], askers[8]
+    granted._of_terse[terse_id(one.key_id)] = [one.key_id, other.key_id]  # as if their names began alike
+    seal = one.question(KEY, b"report", is_bare=False)
+    alike = granted.find_alike(terse_id(one.key_id))
+    assert len(alike) == 2
+    found = under_terse(alike, TerseSeal.decode(one.written(seal)), "question", KEY, b"report")
+    assert found.key_id == one.key_id
+    with pytest.raises(SealError, match="not known here"):
+        under_terse(alike, TerseSeal.decode(one.written(seal)), "question", KEY, b"other")
+    with pytest.raises(SealError, match="not known here"):
+        under_terse([], TerseSeal.decode(one.written(seal)), "question", KEY, b"report")
 
 
 def test_a_second_implementation_finds_the_same() -> None:
@@ -226,6 +331,7 @@ def test_granted_keys_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         assert granted.grant(KeyHalf.make().share, bytes(32), SHARD, replace(VEHICLE, name=f"w{number}"))
     assert len(granted._named) == 6
     assert set(granted._of_name) == {f"w{number}" for number in range(2, 8)}
+    assert sum(map(len, granted._of_terse.values())) == 6 + 5
     assert granted.of_name("w7") is None  # it has not used its key yet
     assert granted.grant(bytes(32), bytes(32), SHARD, None) == b""
 

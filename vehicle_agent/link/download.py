@@ -1,11 +1,12 @@
-"""Tiles from the tile server: soonest needed first, in batches of one district, several on their way at a time."""
+"""Tiles from the tile server: soonest needed first, in batches of a few districts, several on their way at a time."""
 
 import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Final, Generic
 
@@ -35,7 +36,7 @@ RETRY_S = 1.0
 WRONG_TRIES = 3
 MOST_DOUBLINGS = 7
 """Of the pause, while what comes stays wrong: to a minute."""
-MOST_TILES = 1024  # of one district
+MOST_TILES = 1024  # of one district, and of one answer
 FIRST_GUESS_BYTES = 4_096
 HELD_GUESS_BYTES = 64
 LEAST_BESIDES_BYTES: Final = 256
@@ -47,7 +48,7 @@ _SELDOM: Final = Seldom(_log)
 
 @dataclass(frozen=True, slots=True)
 class _TilesQuestion:
-    """What is asked at once, of one district.
+    """What is asked at once, of a few districts.
 
     Attributes:
         tiles: that are wanted, the first one most.
@@ -252,13 +253,13 @@ class TileFetcher(Generic[TileT]):
                 self._line_up()
 
     def _next(self) -> _TilesQuestion | None:
-        """The next question: the first tile that may be asked for now, and more of its district; None when closed."""
+        """The next question: the first tile that may be asked for now, and more that go along; None when closed."""
         with self._changed:
             while not self._closed:
                 now_s = time.monotonic()
                 ready = [t for t in self._waiting if self._not_before.get(t, 0.0) <= now_s]
                 if ready and sum(self._in_flight.values()) <= self._window_bytes:
-                    batch = self._fitting(t for t in ready if t.district == ready[0].district)
+                    batch = self._fitting(self._going_along(ready))
                     self._waiting = [t for t in self._waiting if t not in batch]
                     self._in_flight |= batch
                     question = self._question(batch)
@@ -267,11 +268,19 @@ class TileFetcher(Generic[TileT]):
                 self._changed.wait(POLL_S)
             return None
 
+    def _going_along(self, tiles: Iterable[TileId]) -> Iterator[TileId]:
+        """The first of `tiles`, and those after it that one question can be about."""
+        districts: set[District] = set()
+        for tile_id in tiles:
+            if self._exchange.goes_along(districts, tile_id.district):
+                districts.add(tile_id.district)
+                yield tile_id
+
     def _question(self, batch: dict[TileId, float]) -> _TilesQuestion:
         """A question about tiles that wait, given with the bytes expected. The lock is held."""
-        district = next(iter(batch)).district
+        districts = {tile_id.district for tile_id in batch}
         done = (self._answered - self._stale) | self._in_flight.keys() | self._on_a_map
-        besides = tuple(t for t in self._besides if t.district == district and t not in done)[: MOST_TILES - len(batch)]
+        besides = tuple(t for t in self._besides if t.district in districts and t not in done)
         expected_bytes = max(LEAST_BESIDES_BYTES, round(sum(batch.values())))
         return _TilesQuestion(
             tuple(batch), besides, min(self._batch_bytes, expected_bytes) if besides else self._batch_bytes
@@ -305,7 +314,8 @@ class TileFetcher(Generic[TileT]):
 
     def _bring(self, archive: ArchiveTiles[TileT], tiles: list[TileId]) -> None:
         """Fill the cache from the archive, so that the bus has little to add to it, or none is needed."""
-        brought = archive.bring(tiles)
+        of_district = sorted(tiles, key=lambda tile_id: tile_id.district)
+        brought = sum(archive.bring(list(some)) for _, some in groupby(of_district, lambda tile_id: tile_id.district))
         with self._changed:
             self.counts["archive"] += brought
 
