@@ -298,6 +298,37 @@ def test_attack_version_of_another_tile(scene: VersionScene) -> None:
     scene.client("another").refuses(tile, "does not fit")
 
 
+def test_attack_versions_swapped_between_districts_of_one_question(scene: VersionScene) -> None:
+    """It answers for two districts at once, and gives each the other's version, an altered or an older one."""
+    here = scene.tile(1, 2)
+    there = TileId(here.morton + 1024)
+    for part, seed in (("operator", 3), ("shard", 4)):
+        scene.publish(part, content(there, seed))
+    client, both = scene.client("two districts"), [here, there]
+
+    def said(tile: TileId, of: TileId, version: int) -> TileAnswer:
+        found = stored(scene, of, version)
+        return whole(content(tile, {here: 1, there: 3}[of] + version - 1), version, found.signature)
+
+    others = {here: there, there: here}
+    for alter in (
+        lambda tile, _: said(tile, others[tile], 2),
+        lambda tile, answer: replace(answer, signature=stored(scene, others[tile]).signature),
+        lambda tile, answer: replace(answer, signature=None),
+    ):
+        scene.server.alter = alter
+        outcome = client.exchange.ask(both, (), 1_000_000)
+        assert outcome.wrong.keys() == set(both)
+        assert (outcome.fetched, outcome.unanswered) == ([], [])
+        assert [client.cache.head(tile) for tile in both] == [(0, b"")] * 2
+    scene.server.alter = None
+    assert {one.tile_id for one in client.exchange.ask(both, (), 1_000_000).fetched} == set(both)
+    scene.server.alter = lambda tile, _: said(tile, tile, 1)
+    outcome = client.exchange.ask(both, both, 1_000_000)
+    assert all("older than version 2" in outcome.wrong[tile] for tile in both)
+    assert [client.cache.head(tile)[0] for tile in both] == [2, 2]
+
+
 def test_attack_signature_of_who_signs_no_versions(scene: VersionScene) -> None:
     """It lets a vehicle, itself, and a shard of a foreign authority sign; their certificates are shown, and refused."""
     tile = scene.tile(1)

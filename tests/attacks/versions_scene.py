@@ -18,7 +18,7 @@ from gnd.gnd_map.codec import LATTICES, snap
 from gnd.gnd_map.content import encode_content
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import keys
 from gnd.schemas.tiles import Catalog
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
@@ -71,11 +71,17 @@ class BrokenServer:
     def batch(self, request: Request) -> bytes:
         layer, district = keys.parse_batch_key(request.key)
         wanted = TilesRequest.decode(request.payload)
-        reply = self._answers.many(layer, district, wanted)
+        asked = wanted.by_district(district)
+        reply = self._answers.many(layer, district, wanted, asked)
+        told = reply.by_district(wanted, district)
+        first, *others = (self._altered(one, asked[one], part) for one, part in told.items())
+        return replace(first, others=tuple(others)).encode()
+
+    def _altered(self, district: District, request: TilesRequest, reply: TilesReply) -> TilesReply:
         if self.alter is None:
-            return reply.encode()
-        pairs = reply.of_request(wanted, district)
-        return TilesReply(tuple(self.alter(tile, answer) for tile, answer in pairs)).encode()
+            return reply
+        pairs = reply.of_request(request, district)
+        return TilesReply(tuple(self.alter(tile, answer) for tile, answer in pairs))
 
     def catalog(self, request: Request) -> list[tuple[str, bytes]]:
         entries = tuple(self.store.heads(LAYER))

@@ -9,11 +9,14 @@ from merger_world import POLE, TILE, change_of, report_of
 from gnd.cloud_merger import reception
 from gnd.cloud_merger.ownership import Members, owner_of
 from gnd.cloud_merger.reception import Reception
+from gnd.deploy.fleet_identities import make_identities
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeAck, ChangeReport
-from gnd.schemas.keys import alive_key
+from gnd.schemas.keys import alive_key, change_key
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.sending import SenderThread
 
 TILES = [TileId((TILE.morton & ~1023) + k * 1024 + 5) for k in range(8)]
 REPORTS = [report_of(n, change_of(None, [0], {0: POLE}, tile=tile)) for n, tile in enumerate(TILES)]
@@ -100,3 +103,29 @@ def test_a_key_that_is_no_district_is_answered_rather_than_ignored(cloud, shard)
     with raw_session(cloud.endpoint) as session:
         replies = list(session.get("gnd/v1/change/ndt/9", payload=REPORTS[0].encode(), timeout=5.0))
     assert [ChangeAck.decode(reply.ok.payload.to_bytes()).report_id for reply in replies] == [REPORTS[0].report_id]
+
+
+def test_under_an_agreed_key_an_ack_needs_not_name_its_report(cloud, tmp_path):
+    """The first question is signed, and its ack names the report; from then on the seal shows what is acknowledged."""
+    identities = make_identities(tmp_path, 1, 1)
+    outbox, key = Outbox(tmp_path / "outbox.sqlite"), change_key("ndt", TILE.district)
+
+    def answer(_key, payload, asker):
+        assert asker.name == "vehicle-00"
+        return ChangeAck(payload.decode(), "stored")
+
+    def joined(name):
+        return open_bus(BusConfig(connect=(cloud.endpoint,), identity=identities / name), name=name)
+
+    with joined("merger-0") as shard, joined("vehicle-00") as vehicle:
+        Reception(shard, Members("merger-0"), answer, lambda _: None).open()
+        ids = [report_of(n, change_of(None, [0], {0: POLE})).report_id for n in range(4)]
+        acks = [vehicle.request(key, one.encode(), kind="change", timeout_s=20.0) for one in ids]
+        assert [ChangeAck.decode(ack).report_id for ack in acks] == [ids[0], "", "", ""]
+        for one in ids:
+            outbox.put(one, key, one.encode())
+        sender = SenderThread(vehicle, outbox, "vehicle-00")
+        wait_for("all are acknowledged", lambda: outbox.counts().held == len(ids))
+        assert sender.last_error == ""
+        vehicle.close()
+        sender.close()

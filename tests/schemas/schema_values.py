@@ -22,7 +22,7 @@ from gnd.schemas.packed import PackedGaussians, PackedReport, digest_of
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
 from gnd.schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
-from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
+from gnd.schemas.tiles_batch import OtherTiles, TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.traffic import TrafficLine, TrafficSample
 from gnd.schemas.updates import TileUpdate
 from gnd.schemas.version_signature import VersionSignature
@@ -167,6 +167,13 @@ GOLDEN: dict[str, Any] = {
     "TilesRequest-hashes": TilesRequest(
         ((274, 3), (275, 0), (276, 1)), held_hashes=(SHA[:8], OTHER_SHA[:8]), codecs=(1, 0)
     ),
+    "TilesRequest-others": TilesRequest(
+        ((274, 3),), SHA[:8], others=(OtherTiles(-3, ((0, 1), (7, 0)), OTHER_SHA[:8]), OtherTiles(1, ((1023, 0),)))
+    ),
+    "TilesReply-others": TilesReply(
+        (TileAnswer("unchanged"),),
+        others=(TilesReply((TileAnswer("absent"), TileAnswer("later")), watched=(1,)), None),
+    ),
     "TilesReply-every_status": TilesReply(
         (
             TileAnswer("unchanged"),
@@ -201,6 +208,7 @@ GOLDEN: dict[str, Any] = {
     "ChangeReport-course": report(course=Course(-910, 12)),
     "ChangeReport-unsure": report(tiles=(change(), change(EAST, unsure=met([-690, -2, 78])))),
     "ChangeAck-stored": ChangeAck(REPORT_ID, "stored"),
+    "ChangeAck-unnamed": ChangeAck(REPORT_ID, "stored").unnamed(),
     "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
     "ChangeAck-wanted": ChangeAck(REPORT_ID, "wanted", wanted=b"not looked into"),

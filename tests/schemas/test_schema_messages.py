@@ -466,9 +466,15 @@ def test_a_catalog_out_of_order_is_refused() -> None:
         Catalog((entry, entry))
 
 
-def test_an_ack_needs_an_id_unless_it_quarantines() -> None:
-    with pytest.raises(BadValue, match="report id ''"):
-        ChangeAck("", "stored")
+def test_an_ack_that_asks_for_something_needs_an_id() -> None:
+    for status, wanted in (("wanted", b"x"), ("resend", b"")):
+        with pytest.raises(BadValue, match="report id ''"):
+            ChangeAck("", status, wanted=wanted)  # type: ignore[arg-type]
+        ack = ChangeAck(REPORT_ID, status, wanted=wanted)  # type: ignore[arg-type]
+        assert ack.unnamed() is ack
+    ack = ChangeAck(REPORT_ID, "stored")
+    assert ChangeAck.decode(ack.unnamed().encode()).report_id == ""
+    assert len(ack.encode()) - len(ack.unnamed().encode()) == 28
     assert ChangeAck.decode(ChangeAck("", "quarantined", "no id").encode()).reason == "no id"
     with pytest.raises(BadValue, match="reason"):
         ChangeAck(REPORT_ID, "quarantined", "two\nlines")

@@ -12,12 +12,13 @@ from gnd.gnd_map.codec import CODEC_STANDARD, CODEC_STANDARD_ZSTD, encode_delta,
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import limits
-from gnd.schemas.errors import BadValue, Malformed, TooLarge, WrongHash
+from gnd.schemas.errors import BadValue, Malformed, TooLarge, WrongHash, WrongVersion
 from gnd.schemas.generated import tiles_reply_pb2, tiles_request_pb2
 from gnd.schemas.tiles import CodedDelta, TileReply, blob_of, tile_after, tile_of
 from gnd.schemas.tiles_batch import (
     EVERY_CODEC,
     HeldVersion,
+    OtherTiles,
     TileAnswer,
     TilesReply,
     TilesRequest,
@@ -80,6 +81,43 @@ def test_any_request_survives(held: list[HeldVersion], with_hashes: bool, max_by
 def test_any_reply_survives(answers: list[TileAnswer]) -> None:
     reply = TilesReply(tuple(answers))
     assert TilesReply.decode(reply.encode()) == reply
+
+
+@given(
+    st.dictionaries(st.integers(-40, 40).filter(bool), helds, max_size=3),
+    helds,
+    st.lists(st.none() | st.lists(any_answer(), max_size=5), max_size=3),
+    st.lists(any_answer(), max_size=5),
+)
+@settings(max_examples=60)
+def test_any_request_and_reply_about_several_districts_survives(
+    others: dict[int, list[HeldVersion]],
+    held: list[HeldVersion],
+    told: list[list[TileAnswer] | None],
+    answers: list[TileAnswer],
+) -> None:
+    parts = {}
+    for step, of_home in others.items():
+        moved = [replace(one, tile=TileId(one.tile.morton + 1024 * step)) for one in of_home]
+        parts[moved[0].tile.district] = TilesRequest.of(moved, max_bytes=9)
+    alone = TilesRequest.of(held, max_bytes=9)
+    request = alone.with_others(DISTRICT, parts)
+    again = TilesRequest.decode(request.encode())
+    assert again == request
+    assert again.by_district(DISTRICT) == {DISTRICT: alone} | parts
+    reply = TilesReply(tuple(answers), others=tuple(None if one is None else TilesReply(tuple(one)) for one in told))
+    assert TilesReply.decode(reply.encode()) == reply
+
+
+def test_a_question_about_three_districts_is_shorter_than_three() -> None:
+    """Beside the key and all that a question costs on its way."""
+    steps = {tile_at(0).district: TilesRequest.of([HeldVersion(tile_at(k)) for k in range(0, 1024, 3)])}
+    for step in (1, 2):
+        tiles = [HeldVersion(TileId(tile_at(k).morton + 1024 * step)) for k in range(0, 1024, 3)]
+        steps[tiles[0].tile.district] = TilesRequest.of(tiles)
+    first, *_ = steps.values()
+    together = first.with_others(DISTRICT, {one: part for one, part in steps.items() if one != DISTRICT})
+    assert len(together.encode()) < sum(len(one.encode()) for one in steps.values())
 
 
 def test_a_request_for_the_same_tiles_is_the_same_in_whatever_order_they_are_named() -> None:
@@ -263,6 +301,42 @@ def test_a_request_for_two_districts_is_refused() -> None:
         TilesRequest.of([HeldVersion(TILE), HeldVersion(TILE)])
 
 
+@pytest.mark.parametrize(
+    ("others", "message"),
+    [
+        ((OtherTiles(1, ((0, 0),)), OtherTiles(1, ((1, 0),))), "some of them twice"),
+        (tuple(OtherTiles(n, ((0, 0),)) for n in range(1, 5)), "4 other districts, the limit is 3"),
+    ],
+)
+def test_other_districts_that_cannot_be_are_refused(others: tuple[OtherTiles, ...], message: str) -> None:
+    with pytest.raises((BadValue, TooLarge), match=message):
+        TilesRequest(((0, 0),), others=others)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"step": 0}, "for another district, 0 from the key's"),
+        ({"step": 2**29}, "for another district, 536870912 from the key's"),
+        ({"wanted": ()}, "for no tiles"),
+        ({"wanted": ((0, 1),)}, "1 tiles held of another district and a digest of 0 bytes"),
+        ({"held_digest": bytes(8)}, "0 tiles held of another district and a digest of 8 bytes"),
+    ],
+)
+def test_tiles_of_another_district_that_cannot_be_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadValue, match=message):
+        OtherTiles(**({"step": 1, "wanted": ((0, 0),)} | fields))
+
+
+def test_a_district_outside_the_world_is_refused() -> None:
+    request = TilesRequest(((0, 0),), others=(OtherTiles(-(2**29) + 1, ((0, 0),)),))
+    with pytest.raises(BadValue, match="for the district -536870911 from"):
+        request.by_district(DISTRICT)
+    hashes = TilesRequest(((0, 3),), held_hashes=(bytes(8),))
+    with pytest.raises(BadValue, match="with the hashes of what is held of another district"):
+        TilesRequest(((0, 0),)).with_others(DISTRICT, {tile_at(0).district: hashes})
+
+
 def request_bytes(**fields: Any) -> bytes:
     plain = {"major": 1, "wanted": encode_tiles([(0, 3)]), "held_digest": bytes(8)}
     return tiles_request_pb2.TilesRequest(**(plain | fields)).SerializeToString()
@@ -324,6 +398,29 @@ def test_hostile_reply_bytes_are_refused(fields: dict[str, Any], error: type[Exc
     with pytest.raises(error, match=message):
         TilesReply.decode(reply_bytes(**fields))
     assert TilesReply.decode(reply_bytes()).answers == (TileAnswer("blob", 4, HASH, 0, b"body"),)
+
+
+def test_replies_about_other_districts_that_cannot_be_are_refused() -> None:
+    request = TilesRequest(((0, 0),), others=(OtherTiles(1, ((0, 0),)), OtherTiles(2, ((0, 0),))))
+    absent = TilesReply((TileAnswer("absent"),))
+    assert list(absent.by_district(request, DISTRICT)) == [DISTRICT], "an older server"
+    assert len(replace(absent, others=(None, absent)).by_district(request, DISTRICT)) == 2
+    with pytest.raises(BadValue, match="about 1 other districts, asked for 2"):
+        replace(absent, others=(absent,)).by_district(request, DISTRICT)
+    with pytest.raises(BadValue, match="itself about others"):
+        replace(absent, others=(replace(absent, others=(None,)),))
+    deep = absent.encode()
+    for _ in range(100):  # as deep as it may be: refused before what is below is read
+        deep = reply_bytes(others=[deep])
+    for others, error, message in (
+        ([deep], BadValue, "itself about others"),
+        ([b"\xff"], Malformed, "truncated"),
+        ([reply_bytes(major=2)], WrongVersion, "major version 2"),
+        ([b""] * 4, TooLarge, "4 other districts, the limit is 3"),
+        ([reply_bytes(bodies=[b""] * 6000)], TooLarge, "more than 5184 fields"),
+    ):
+        with pytest.raises(error, match=message):
+            TilesReply.decode(reply_bytes(others=others))
 
 
 def test_a_truncated_reply_is_malformed() -> None:

@@ -17,10 +17,11 @@ from gnd.gnd_map.codec import encode_delta
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
-from gnd.schemas.keys import batch_key
+from gnd.schemas.keys import batch_key, batch_keys, parse_batch_key
 from gnd.schemas.tiles import blob_of
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from gnd.tile_client.exchange import Exchange, shares_of
+from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.config import DownloadParameters
@@ -93,6 +94,81 @@ def test_what_does_not_fit_comes_with_a_later_question_and_nothing_twice(
     assert waiting == []
     assert sorted(came) == sorted(t for t in tiles if t.district == district)
     assert all(cache.head(t)[1] == tiles[t].sha for t in came)
+
+
+def two_districts(tiles: dict[TileId, Tile]) -> list[TileId]:
+    """Tiles of two districts: where the ground's do not reach a border, absent ones of the next."""
+    first = sorted(tiles)[0]
+    return [*sorted(t for t in tiles if t.district == first.district)[:3], TileId(first.morton + 1024)]
+
+
+def test_tiles_of_two_districts_are_asked_for_at_once(
+    exchange: Exchange, cache: TileCache, cloud: Bus, tmp_path: Path, tiles: dict[TileId, Tile]
+) -> None:
+    """With what is held of both; a store that does not know that is told by hashes, district by district."""
+    here = one(tiles)
+    there = Tile(TileId(here.tile_id.morton + 1024), 1, here.gaussians)
+    wanted = [here.tile_id, there.tile_id]
+    with SqliteStore(tmp_path / "store.sqlite") as store:
+        store.put_tiles([here, there])
+        with TileServer(store, cloud):
+            first = exchange.ask(wanted, (), LARGE, near=here.tile_id)
+            assert [fetched.status for fetched in first.fetched] == ["blob", "blob"]
+            store.put_tiles([without(there, 3, version=2)])
+            again = exchange.ask(wanted, (), LARGE)
+            assert [fetched.status for fetched in again.fetched] == ["unchanged", "delta"]
+            cache.put(without(there, 9, version=7), over=cache.head(there.tile_id)[1])
+            foreign = exchange.ask(wanted, (), LARGE)
+    assert [fetched.status for fetched in foreign.fetched] == ["unchanged", "blob"]
+    assert foreign.unanswered == []
+
+
+@pytest.mark.parametrize("told", ["an older server", "a server of other districts"])
+def test_districts_that_do_not_go_along_are_asked_for_one_by_one(
+    bus: Bus, cache: TileCache, cloud: Bus, tmp_path: Path, tiles: dict[TileId, Tile], told: str
+) -> None:
+    wanted, asked = two_districts(tiles), list[TilesRequest]()
+    with SqliteStore(tmp_path / "store.sqlite") as store:
+        store.put_tiles(list(tiles.values()))
+        answers = TileAnswers(store)
+
+        def answer(request: Request) -> bytes:
+            layer, district = parse_batch_key(request.key)
+            asked.append(TilesRequest.decode(request.payload))
+            others = (None,) * len(asked[-1].others) if told == "a server of other districts" else ()
+            return replace(answers.many(layer, district, asked[-1]), others=others).encode()
+
+        cloud.serve(batch_keys(), answer)
+        fetcher = TileFetcher(bus, cache, DownloadParameters(in_flight=1))
+        fetcher.want(wanted)
+        assert fetcher.wait_for(wanted, 15.0, threading.Event()) == set()
+        fetcher.recheck()
+        wait_until(lambda: len(asked) == 4)
+        assert fetcher.wait_for(wanted, 15.0, threading.Event()) == set()
+        bus.close()
+        fetcher.close()
+    assert [len(request.others) for request in asked] == [1, 0, 0, 0], "they go along no more"
+    assert fetcher.counts == {"blob": 3, "absent": 2, "unchanged": 3}
+
+
+def test_bodies_of_all_districts_share_the_room_of_an_answer(
+    exchange: Exchange, cloud: Bus, tmp_path: Path, tiles: dict[TileId, Tile]
+) -> None:
+    """Those around the tile that is needed first come first, whichever district they are of."""
+    here = one(tiles)
+    copies = [Tile(TileId(here.tile_id.morton + 1024 * step), 1, here.gaussians) for step in range(4)]
+    wanted = [tile.tile_id for tile in copies]
+    with SqliteStore(tmp_path / "store.sqlite") as store:
+        store.put_tiles(copies)
+        with TileServer(store, cloud):
+            outcome = exchange.ask(wanted, (), 1, near=wanted[0])
+    assert [fetched.tile_id for fetched in outcome.fetched] == wanted[:1]
+    assert sorted(outcome.later) == sorted(wanted[1:])
+    districts = [tile.district for tile in wanted]
+    fifth = TileId(wanted[0].morton + 4096).district
+    assert exchange.goes_along(districts[:3], districts[3])
+    assert not exchange.goes_along(districts, fifth)
+    assert exchange.goes_along(districts, districts[0])
 
 
 def test_a_store_that_does_not_know_what_is_held_is_told_by_hashes(

@@ -115,6 +115,16 @@ def test_an_answer_for_another_report_is_no_acknowledgement(start: Opener, outbo
     assert outbox.counts().pending == 1
 
 
+def test_an_answer_without_an_id_counts_only_where_a_seal_binds_it(start: Opener, outbox: Outbox, cloud: Bus) -> None:
+    """In a session without identities nothing shows what it answers."""
+    cloud.serve(change_keys(), lambda _: ChangeAck(report_id(1), "stored").unnamed().encode())
+    outbox.put(report_id(1), KEY, b"body")
+    sender = start()
+    wait_until(lambda: sender.last_error)
+    assert "was answered for report without an id" in sender.last_error
+    assert outbox.counts().pending == 1
+
+
 def test_a_restarted_sender_sends_only_what_is_open(start: Opener, outbox: Outbox, cloud: Bus) -> None:
     outbox.put(report_id(1), KEY, report_id(1).encode())
     outbox.put(report_id(2), KEY, report_id(2).encode())
