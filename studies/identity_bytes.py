@@ -13,8 +13,9 @@ from gnd.deploy.fleet_identities import make_identities
 from studies.frame.measure import Figure
 from studies.security_study.kilometre import (
     KILOMETRE,
-    KILOMETRE_BEFORE,
-    KILOMETRE_IN_HALVES,
+    KILOMETRE_APART,
+    NAME_BYTES,
+    WORD,
     KilometreMessage,
     Wired,
     router,
@@ -23,10 +24,9 @@ from studies.security_study.kilometre import (
 
 TIMES: Final = 30
 _WAYS: Final = (("plain", "tcp", False), ("seals", "tcp", True), ("seals and TLS", "tls", True))
-_ONE_OF_EACH: Final = tuple({one.what: one for one in reversed(KILOMETRE_IN_HALVES)}.values())
+_ONE_OF_EACH: Final = tuple({one.what: one for one in reversed((*KILOMETRE, WORD))}.values())
 _KILOMETRES: Final = {
-    "a kilometre before decision 167": KILOMETRE_BEFORE,
-    "a kilometre before decision 173": KILOMETRE_IN_HALVES,
+    "a kilometre with a question a district": KILOMETRE_APART,
     "a kilometre": KILOMETRE,
 }
 _NAMES: Final = {
@@ -107,6 +107,8 @@ def _by_kilometre(costs: dict[str, _Cost]) -> list[Figure]:
         plain_mean, _, tls_mean = (_kilometre(cost.mean, said) for cost in costs.values())
         counted = ", ".join(f"{n} x {what}" for what, n in Counter(one.what for one in said).items())
         added = f"seals add {seals - plain:.0f} B, TLS {tls - seals:.0f} B: {100 * (tls / plain - 1):+.1f} %"
+        named = tls + sum(NAME_BYTES for one in said if one.named)
+        added += f"; did acks name their reports {100 * (named / plain - 1):+.1f} %"
         added += f" (by means {plain_mean:,.0f} and {tls_mean:,.0f} B: {100 * (tls_mean / plain_mean - 1):+.1f} %)"
         found += [Figure(f"{name}, plain", plain, "B", counted), Figure(f"{name}, seals and TLS", tls, "B", added)]
     return found

@@ -14,6 +14,7 @@ from gnd.fleet_bus.publishers import Publishers
 from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.content import AnyTile, day_of_tile
 from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import NotSigned
 from gnd.schemas.version_signature import VersionSignature
@@ -65,6 +66,11 @@ class SeenInMemory:
             self._seen[tile] = before if before.is_newer_than(seen.made_s, seen.version) else seen
             if len(self._seen) > MOST_SEEN:
                 self._seen.popitem(last=False)
+
+    def versions(self, region: Region) -> dict[TileId, int]:
+        """The newest version of each tile of a region that was seen."""
+        with self._lock:
+            return {tile: seen.version for tile, seen in self._seen.items() if tile in region}
 
 
 class VersionCheck:

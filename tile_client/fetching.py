@@ -12,7 +12,9 @@ from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import batch_key, catalog_keys
 from gnd.schemas.tiles import Catalog, CatalogEntry
-from gnd.tile_client.checking import VersionCheck
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_client.catalog_check import set_back
+from gnd.tile_client.checking import SeenInMemory, VersionCheck
 from gnd.tile_client.exchange import Exchange, ExchangeOutcome, TilesInMemory
 
 BATCH_BYTES: Final = 1_000_000
@@ -30,6 +32,8 @@ class TileServerClient:
         timeout_s: how long one question is asked again before it fails.
         newest: fetch the newest versions, also those that are on trial with a share of the vehicles.
         check: of the versions that come: by the identity of the bus; None where it has none.
+        behind: tiles of which the last catalog names an older version than was seen, or none: see
+            `catalog_check.set_back`.
     """
 
     bus: Bus
@@ -37,20 +41,30 @@ class TileServerClient:
     timeout_s: float
     newest: bool = False
     check: VersionCheck | None = field(init=False, repr=False)
+    behind: dict[TileId, int | None] = field(init=False, repr=False, default_factory=dict)
+    _seen: SeenInMemory = field(init=False, repr=False, default_factory=SeenInMemory)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "check", VersionCheck.on_the_bus(self.bus, self.layer))
+        object.__setattr__(self, "check", VersionCheck.on_the_bus(self.bus, self.layer, self._seen))
 
     def catalog(self, region: Region) -> list[CatalogEntry]:
-        """The newest version of each tile of the region, by tile.
+        """The newest version of each tile of the region, by tile; that it goes back behind what was seen is noticed.
 
         Raises:
             RequestFailed: nobody answers within `timeout_s`.
         """
-        keys = catalog_keys(self.layer, region.prefix)
+        keys, seen = catalog_keys(self.layer, region.prefix), self._seen.versions(region)
         replies = self.bus.request_many(keys, b"", kind="catalog", timeout_s=self.timeout_s)
-        entries = (entry for _, payload in replies for entry in Catalog.decode(payload).entries)
-        return sorted((entry for entry in entries if entry.tile in region), key=lambda entry: entry.tile)
+        entries = [entry for _, payload in replies for entry in Catalog.decode(payload).entries if entry.tile in region]
+        behind = set_back(self.layer, seen, entries, newest=self.newest)
+        self.behind.clear()
+        self.behind.update(behind)
+        return sorted(entries, key=lambda entry: entry.tile)
+
+    def note_announced(self, update: TileUpdate) -> None:
+        """A notice that a shard has sealed: from now on an older version will not do, nor a catalog that names one."""
+        if self.check is not None:
+            self.check.note_announced(update.tile, update.made_s, update.version)
 
     def fetch(self, tiles: Sequence[TileId], held: Mapping[TileId, AnyTile] = _NOTHING_HELD) -> Iterator[AnyTile]:
         """The newest versions of tiles, by tile; those that the server has not are left out.

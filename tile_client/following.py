@@ -88,6 +88,8 @@ class RegionFollower:
         if notice is None:
             return self._missed() if self._notices.may_have_been_lost() else []
         update = notice.update
+        if update.layer in self._asking:
+            self._asking[update.layer].note_announced(update)
         return [NewVersion(update.layer, update.tile, update.version, notice)] if update.tile in self._region else []
 
     def _missed(self) -> list[NewVersion]:

@@ -26,40 +26,35 @@ class KilometreMessage:
     Attributes:
         what: a question about the map; a report; a word of the shard to the vehicle; a sample of telemetry.
         up: payload bytes from the vehicle.
-        down: payload bytes to it.
+        down: payload bytes to it, of an answer that says to what it is one.
+        named: so many of these say to what it is one: they are left out where the seal shows that.
     """
 
     what: What
     up: int
     down: int
+    named: int = 0
 
 
+NAME_BYTES: Final = 28
+"""Of the report's id in an ack."""
 _ACK_BYTES: Final = 32
 _TOLD_BYTES: Final = 22
 """What an ack tells of the report before."""
-_HALVES: Final = ((183, 28), (80, 24), (195, 28), (91, 24))
-_IN_HALVES: Final = tuple(
-    one
-    for up, down in _HALVES
-    for one in (KilometreMessage("report", up, _ACK_BYTES), KilometreMessage("word", 0, down))
-)
-_AT_ONCE: Final = tuple(KilometreMessage("report", up, _ACK_BYTES + _TOLD_BYTES) for up in (240, 263))
-"""The same reports with their Gaussians, 51 and 62 bytes: 3 of 6 bytes in front of them say that they are there, 3 that
-the vehicle is patient."""
-_QUESTIONS: Final = tuple(KilometreMessage("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6)))
+_REPORTS: Final = tuple(KilometreMessage("report", up, _ACK_BYTES + _TOLD_BYTES, NAME_BYTES) for up in (240, 263))
+"""Those of the drive of decision 167 with their Gaussians, 51 and 62 bytes, packed as they are since decision 173."""
 _TELEMETRY: Final = (KilometreMessage("telemetry", 62, 0), KilometreMessage("telemetry", 159, 0))
-KILOMETRE: Final = (*_QUESTIONS, *_AT_ONCE, *_TELEMETRY)
+WORD: Final = KilometreMessage("word", 0, 28)
+"""What a shard tells where a vehicle is not patient, or something is wanted of it: none in this kilometre."""
+KILOMETRE: Final = (KilometreMessage("question", 210, 90), *_REPORTS, *_TELEMETRY)
 """Payload bytes as the ledger of `gnd reproduce steady-vehicle --length 1000 --pace 2` (seed 201) has them, without the
 report that the end of the drive makes."""
-KILOMETRE_IN_HALVES: Final = (*_QUESTIONS, *_IN_HALVES, *_TELEMETRY)
-"""The same where Gaussians were asked for however few they were, and each word was a message, before decision 173."""
-_ASKED_BEFORE: Final = ((70, 13), (46, 6), (42, 6), (66, 9), (35, 5), (34, 5), (36, 5), (33, 5), (39, 5))
-KILOMETRE_BEFORE: Final = (
-    *(KilometreMessage("question", up, down) for up, down in _ASKED_BEFORE),
-    *_IN_HALVES,
+KILOMETRE_APART: Final = (
+    *(KilometreMessage("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6))),
+    *_REPORTS,
     *_TELEMETRY,
 )
-"""The same where also tiles on no map were asked about one by one, before decision 167."""
+"""The same with a question a district, before decision 178."""
 PAUSE_S: Final = 0.3
 _ASKED: Final = "gnd/v1/tiles/ndt/13033/03021/21000"
 _REPORTED: Final = "gnd/v1/change/ndt/13033/03021/21000"
@@ -74,11 +69,11 @@ class Wired:
     shard: Bus
 
     def say(self, one: KilometreMessage) -> None:
-        """One message, with what comes back; its packets have passed when this returns.
+        """One message, with what comes back; its packets have passed when this returns. It says how much that is.
 
         No keep-alives are among it: they are sent after 30 s of silence.
         """
-        asked = one.down.to_bytes(2, "big") + bytes(max(one.up - 2, 0))  # how much is to be answered
+        asked = one.down.to_bytes(2, "big") + one.named.to_bytes(2, "big") + bytes(max(one.up - 4, 0))
         if one.what == "question":
             self.vehicle.request(_ASKED, asked, kind="tile", timeout_s=20)
         elif one.what == "report":
@@ -99,7 +94,9 @@ class Wired:
 
 
 def _as_much_as_asked(request: Request) -> bytes:
-    return bytes(int.from_bytes(request.payload[:2], "big"))
+    return bytes(
+        int.from_bytes(request.payload[:2], "big") - int.from_bytes(request.payload[2:4], "big") * request.binds
+    )
 
 
 @contextmanager

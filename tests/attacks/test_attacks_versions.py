@@ -8,6 +8,7 @@ from dataclasses import replace
 import apsw
 import numpy as np
 import pytest
+import zenoh
 from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -20,16 +21,18 @@ from gnd.cloud_merger.stored import Bases
 from gnd.deploy.map_cli import map_group
 from gnd.deploy.watch import TileWatch, WatchEvent
 from gnd.fleet_bus.bus import open_bus
-from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.config import BusConfig, zenoh_config
 from gnd.fleet_bus.errors import RequestFailed
 from gnd.fleet_bus.identity.following import follow_revoked
+from gnd.fleet_bus.refusals import refusals
 from gnd.fleet_bus.rights import REVOKED_KEY
 from gnd.gnd_map.content import encode_content
 from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import keys
 from gnd.schemas.keys import update_keys
-from gnd.schemas.tiles import Catalog
+from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.schemas.tiles_batch import TileAnswer
 from gnd.schemas.updates import TileUpdate
 from gnd.tile_client.checking import SeenInMemory, SeenVersion, VersionCheck
@@ -455,6 +458,71 @@ def test_attack_catalog_that_lies(scene: VersionScene) -> None:
         assert watch._is_proven(true, follower)
     finally:
         follower.close()
+
+
+def test_attack_catalog_that_goes_back(scene: VersionScene, caplog: pytest.LogCaptureFixture) -> None:
+    """Its catalog goes back to an older version, or leaves a tile out; who has fetched the tile, or heard the shard's
+    notice of it, notices and counts it."""
+    tile, heard, other = scene.tile(1), scene.tile(2), scene.tile(3)
+    asking = TileServerClient(scene.watcher, LAYER, 10.0)
+    region = Region(prefix="")
+    assert len(list(asking.fetch([tile, other]))) == 2
+    scene.publish("shard", content(tile, 4))
+    first = {one.tile: one for one in asking.catalog(region)}
+    assert first[tile].version == 2
+    assert asking.behind == {}
+    list(asking.fetch([tile]))
+    new = stored(scene, heard)
+    made_s = new.created_ns // 10**9 + 1
+    asking.note_announced(TileUpdate(heard, LAYER, 2, 1, bytes(32), new.sha, "base", made_s=made_s, put_count=1))
+    before = refusals()
+    old = {tile: replace(first[tile], version=1, sha=stored(scene, tile, 1).sha)}
+    scene.server.alter_catalog = lambda said: Catalog(
+        tuple(old.get(one.tile, one) for one in said.entries if one.tile != other)
+    )
+    with caplog.at_level("WARNING"):
+        asking.catalog(region)
+    assert asking.behind == {tile: 1, heard: 1, other: None}
+    assert "goes back behind what was seen of 3 tiles" in caplog.text
+    for reason, n in (("older", 2), ("left out", 1)):
+        assert refusals()["catalog", reason] - before.get(("catalog", reason), 0) == n
+    scene.server.alter_catalog = None
+    asking.catalog(region)
+    assert asking.behind == {heard: 1}, "the notice's version has not come"
+    on_trial = TileServerClient(scene.watcher, LAYER, 10.0, newest=True)
+    list(on_trial.fetch([tile, other]))
+    scene.server.alter_catalog = lambda said: Catalog(tuple(old.get(one.tile, one) for one in said.entries))
+    on_trial.catalog(region)
+    assert on_trial.behind == {}, "a catalog names what is released"
+
+
+def test_attack_catalog_of_a_router(scene: VersionScene) -> None:
+    """Somebody without a tile server's certificate answers for the catalog, also with one that was true before."""
+    tile = scene.tile(1)
+    kept: list[tuple[str, bytes, bytes]] = []
+    with zenoh.open(zenoh_config(BusConfig(connect=(scene.endpoint,)))) as stranger:
+        for reply in stranger.get(f"gnd/v1/catalog/{LAYER}/**", payload=b""):
+            assert reply.ok is not None
+            seal = b"" if reply.ok.attachment is None else reply.ok.attachment.to_bytes()
+            kept.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes(), seal))
+        assert kept
+        forged = Catalog((CatalogEntry(tile, 77, bytes(32)),)).encode()
+        said = [*kept, (keys.catalog_key(LAYER, tile.district), forged, b"")]
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                for key, payload, seal in said:
+                    query.reply(key, payload, attachment=seal or None)
+
+        queryable = stranger.declare_queryable("gnd/v1/catalog/**", answer)
+        try:
+            time.sleep(0.5)
+            scene.publish("shard", content(tile, 2))
+            asking = TileServerClient(scene.watcher, LAYER, 10.0)
+            found = {one.tile: one.version for one in asking.catalog(Region(prefix=""))}
+            assert found[tile] == 2
+        finally:
+            queryable.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub
 
 
 def test_attack_version_from_the_future(scene: VersionScene) -> None:

@@ -23,7 +23,7 @@ from gnd.fleet_bus.publishers import Publishers
 from gnd.fleet_bus.remembered import read_chains
 from gnd.fleet_bus.seal_keys import certificates_of, holder_of, holder_of_chain, read_revoked
 from gnd.fleet_bus.seals import Seal
-from gnd.fleet_bus.short_seals import ShortSeal
+from gnd.fleet_bus.short_seals import ShortSeal, TerseSeal
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.generated import health_report_pb2
 from gnd.schemas.health import HealthReport, TileHealth
@@ -99,6 +99,10 @@ def _short_seals() -> list[bytes]:
     return [seal.encode() for seal in seals]
 
 
+def _terse_seals() -> list[bytes]:
+    return [TerseSeal(7, 200, bytes(4)).encode(), TerseSeal((1 << 14) - 1, 0, bytes(8)).encode()]
+
+
 def _known() -> list[bytes]:
     chain = _chain()
     return [2 * (len(chain).to_bytes(2, "little") + chain), b""]
@@ -114,6 +118,14 @@ TARGETS = (
         "short seals (attachments)",
         lambda data: ShortSeal.decode(data).encode(),
         _short_seals,
+        bytes_mutated,
+    ),
+    FuzzTarget(
+        "terse-seal",
+        ("fleet_bus/short_seals.py:TerseSeal.decode",),
+        "terse seals (attachments)",
+        lambda data: TerseSeal.decode(data).whole("question", b"key", 1000).encode(),
+        _terse_seals,
         bytes_mutated,
     ),
     FuzzTarget(
