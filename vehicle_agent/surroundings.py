@@ -3,7 +3,7 @@
 import math
 import threading
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +13,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.errors import TileError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
-from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.gnd_map.tile_id import District, TileId, covering_corridor
 from gnd.schemas.limits import MAX_TILES_OF_DISTRICT
 from gnd.tile_client.exchange import Fetched
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
@@ -31,6 +31,9 @@ HELD_AROUND_M: Final = 1300.0
 """And so are those that the cache holds of the districts of the plan: they do not change with every degree of the
 heading, as what lies straight ahead does."""
 MOST_AROUND: Final = 256
+NEARBY_M: Final = 500.0
+"""What lies so far to either side of a place is of four districts at most, which are 1.2 km wide or, towards the poles,
+less."""
 KNOWN_SHARE: Final = 0.25
 BEYOND_STEP_M: Final = 60.0
 LINK_SHARE = 0.8  # part of the link's rate that the plan counts on
@@ -60,10 +63,12 @@ class Surroundings:
         self._looked_at: F64 | None = None
         self._here: F64 | None = None
         self._asked: set[TileId] = set()  # with the last question, and not let go since
-        self._besides: tuple[TileId, ...] = ()  # named with it
+        self._besides: tuple[TileId, ...] = ()  # named with the next one, whenever that is
+        self._named: frozenset[District] = frozenset()  # of these districts
         self._passed: set[TileId] = set()  # let go: asked for again when they are wanted, not before
         self._beyond: tuple[TileId, ...] = ()  # farther ahead than the plan
         self._looked_beyond: F64 | None = None
+        self._farthest: F64 | None = None  # of the way ahead
         self._plan: list[Need] = []
         self._plan_is_new = False
         self._near: tuple[TileId, ...] = ()
@@ -137,6 +142,7 @@ class Surroundings:
     def _look_beyond(self, place: Place) -> None:
         """Which tiles lie farther ahead than the plan; found anew after some way, or where the course has turned."""
         ahead = place.ahead_map_m(HELD_AHEAD_M)
+        self._farthest = ahead[-1]
         before = self._looked_beyond
         if before is None or before.shape != ahead.shape or np.abs(ahead - before).max() > BEYOND_STEP_M:
             self._looked_beyond = ahead
@@ -153,7 +159,8 @@ class Surroundings:
         lead_s = LEAD_S + self._download_s(plan)
         if any(need.from_s <= lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
             self._asked = {need.tile_id for need in plan} | self._known_beyond() | self._still_around()
-            self._besides = self._of_known_districts()
+            self._named = frozenset()
+        self._name_besides()
         first = [need.tile_id for need in plan if need.tile_id in self._asked]
         self._fetcher.want([*first, *sorted(self._asked.difference(first))], self._besides)
 
@@ -165,16 +172,32 @@ class Surroundings:
         held = sum(map(self._fetcher.is_held, beyond))
         return beyond | self._held_around() if held >= KNOWN_SHARE * len(beyond) else set()
 
-    def _of_known_districts(self) -> tuple[TileId, ...]:
-        """All tiles of the plan's districts, where the cache holds much of the plan: most are on no map, and to hear so
-        of a whole district costs a few bytes more than of the tiles ahead, which change with the heading.
+    def _name_besides(self) -> None:
+        """Which tiles the next question names besides, whenever it is asked: found anew where the districts change."""
+        districts = frozenset({tile.district for tile in self.wanted} | self._nearby())
+        if districts != self._named:
+            self._named, self._besides = districts, self._of_known_districts(districts)
+
+    def _of_known_districts(self, districts: Collection[District]) -> tuple[TileId, ...]:
+        """All tiles of the plan's districts and of those nearby, where the cache holds much of the plan: most are on no
+        map, and to hear so of a whole district costs a few bytes more than of the tiles ahead, which change with the
+        heading; to ask about the next district when it is reached costs a question.
         """
         if sum(map(self._fetcher.is_held, self.wanted)) < KNOWN_SHARE * len(self.wanted):
             return ()
-        districts = sorted({tile.district for tile in self.wanted})
-        every = (TileId(one.first_morton + index) for one in districts for index in range(MAX_TILES_OF_DISTRICT))
+        every = (
+            TileId(one.first_morton + index) for one in sorted(districts) for index in range(MAX_TILES_OF_DISTRICT)
+        )
         known = self._asked.union(self._passed, self._fetcher.held_of(districts))
         return tuple(tile for tile in every if tile not in known)
+
+    def _nearby(self) -> set[District]:
+        """The four districts that are nearest to what lies ahead, or fewer: one question can be about so many."""
+        if self._farthest is None:
+            return set()
+        corners = self._farthest + NEARBY_M * np.array([[x, y, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+        lat, lon, _ = self._map.grid_frame.frame.geodetic_from_enu(corners)
+        return {TileId.from_geodetic(*corner).district for corner in zip(lat.tolist(), lon.tolist(), strict=True)}
 
     def _still_around(self) -> set[TileId]:
         """Those of the tiles asked for before that are not far away: who forgets them asks again."""

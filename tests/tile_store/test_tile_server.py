@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
+from click.testing import CliRunner
 from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
 
 from gnd.fleet_bus.bus import Bus, open_bus
@@ -23,8 +24,10 @@ from gnd.gnd_map.day import day_of
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import keys
 from gnd.schemas.tiles import Catalog, TileReply, TileRequest, tile_of
-from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest, tile_of_answer
+from gnd.schemas.tiles_batch import HeldVersion, OtherTiles, TileAnswer, TilesReply, TilesRequest, tile_of_answer
+from gnd.tile_store.copying import district
 from gnd.tile_store.errors import StoreError
+from gnd.tile_store.regions_cli import regions
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoredTile
@@ -134,6 +137,39 @@ def test_a_region_is_answered_with_one_reply_a_tile_and_nothing_outside_it(clien
     }
     request = TileRequest(1, tile_of_voxels(TILE, 1, 2).sha)
     assert asked(keys.tiles_key("ndt", "13033"), request) == here | {keys.tile_key("ndt", TILE): "unchanged"}
+
+
+def test_other_districts_of_a_question_are_answered_by_who_owns_them(
+    endpoint: str, client: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Alone a store answers for both districts of a question; once one has moved to another store it says so of it."""
+    monkeypatch.setattr(district, "NOTICED_S", 0.0)
+    here, there = f"sqlite:{tmp_path}/here.db", f"sqlite:{tmp_path}/there.db"
+    request = TilesRequest.of([HeldVersion(TILE)]).with_others(
+        TILE.district, {FAR.district: TilesRequest.of([HeldVersion(FAR)])}
+    )
+
+    def answered(store: SqliteStore) -> tuple[str, list[str | None]]:
+        with open_bus(BusConfig(connect=(endpoint,)), name="store") as bus, TileServer(store, bus):
+            key = keys.batch_key("ndt", TILE.district)
+            reply = TilesReply.decode(client.request(key, request.encode(), kind="tile", timeout_s=20.0))
+        assert len(reply.others) == 1
+        return reply.answers[0].status, [None if one is None else one.answers[0].status for one in reply.others]
+
+    with SqliteStore(tmp_path / "here.db", EAGER) as store:
+        store.put_tiles([tile_of_voxels(tile, 1, 2) for tile in (TILE, FAR)])
+        assert answered(store) == ("blob", ["blob"])
+    for words in (["create", there, "east"], ["move", FAR.district.path, "--from", here, "--to", there]):
+        done = CliRunner().invoke(regions, words)
+        assert done.exit_code == 0, done.output
+    with SqliteStore(tmp_path / "here.db", EAGER) as store:
+        assert answered(store) == ("blob", [None])
+
+
+@pytest.mark.usefixtures("server")
+def test_a_district_outside_the_world_is_refused_by_name(client: Bus) -> None:
+    request = TilesRequest(((0, 0),), others=(OtherTiles(1 - 2**29, ((0, 0),)),))
+    assert "for the district -536870911 from" in refusal(client, keys.batch_key("ndt", TILE.district), request.encode())
 
 
 @pytest.mark.usefixtures("server")

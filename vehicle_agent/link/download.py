@@ -128,8 +128,8 @@ class TileFetcher(Generic[TileT]):
 
         Args:
             tiles: the tiles.
-            besides: tiles that a question about their district names, too, if there is one: that they are on no map
-                costs next to nothing to hear; what is on one is not brought for that.
+            besides: tiles that a question names, too, if there is one that their district goes along with: that they
+                are on no map costs next to nothing to hear; what is on one is not brought for that.
         """
         with self._changed:
             self._wanted, self._besides = tuple(tiles), tuple(besides)
@@ -268,9 +268,9 @@ class TileFetcher(Generic[TileT]):
                 self._changed.wait(POLL_S)
             return None
 
-    def _going_along(self, tiles: Iterable[TileId]) -> Iterator[TileId]:
-        """The first of `tiles`, and those after it that one question can be about."""
-        districts: set[District] = set()
+    def _going_along(self, tiles: Iterable[TileId], districts: Collection[District] = ()) -> Iterator[TileId]:
+        """Those of `tiles`, from the first on, that one question can be about, if it is about these districts, too."""
+        districts = set(districts)
         for tile_id in tiles:
             if self._exchange.goes_along(districts, tile_id.district):
                 districts.add(tile_id.district)
@@ -280,7 +280,7 @@ class TileFetcher(Generic[TileT]):
         """A question about tiles that wait, given with the bytes expected. The lock is held."""
         districts = {tile_id.district for tile_id in batch}
         done = (self._answered - self._stale) | self._in_flight.keys() | self._on_a_map
-        besides = tuple(t for t in self._besides if t.district in districts and t not in done)
+        besides = tuple(self._going_along((t for t in self._besides if t not in done), districts))
         expected_bytes = max(LEAST_BESIDES_BYTES, round(sum(batch.values())))
         return _TilesQuestion(
             tuple(batch), besides, min(self._batch_bytes, expected_bytes) if besides else self._batch_bytes
