@@ -48,7 +48,7 @@ class _Sent:
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
+class _DistrictAnswers:
     """What is answered of one district.
 
     Attributes:
@@ -136,7 +136,7 @@ class TileAnswers:
         assert of_district is not None
         return replace(of_district, others=tuple(of_others))
 
-    def _part(self, layer: str, district: District, request: TilesRequest) -> "_Part":
+    def _part(self, layer: str, district: District, request: TilesRequest) -> "_DistrictAnswers":
         """What can be said of a district without any body."""
         tiles = request.tiles(district)
         newest = {entry.tile: entry for entry in self._store.heads(layer, district.path)}
@@ -144,7 +144,7 @@ class TileAnswers:
         held = self._held(layer, district, request, newest)
         heads = heads_for(request, newest, trials, held) if trials else newest
         answers = {tile: _without_body(heads.get(tile), held[tile]) for tile in tiles}
-        return _Part(heads, held, frozenset(trials), answers, is_of_vehicle=request.ticket > 0)
+        return _DistrictAnswers(heads, held, frozenset(trials), answers, is_of_vehicle=request.ticket > 0)
 
     def _answer(
         self, layer: str, tile: TileId, version: int | None, held: bytes, codecs: tuple[int, ...]
@@ -327,8 +327,8 @@ def _without_body(head: CatalogEntry | None, held: bytes | None) -> TileAnswer:
 
 
 def _nearest_first(
-    tiles: list[tuple[TileId, _Part]], district: District, near: int | None
-) -> list[tuple[TileId, _Part]]:
+    tiles: list[tuple[TileId, _DistrictAnswers]], district: District, near: int | None
+) -> list[tuple[TileId, _DistrictAnswers]]:
     """The tiles by their distance from the one of the district with index `near`; in order without one."""
     if near is None:
         return tiles
