@@ -130,13 +130,13 @@ class AgreedKey:
         """A seal under this key as it goes out."""
         return seal.encode_terse() if self.is_terse else seal.encode()
 
-    def read_answer(self, attachment: bytes) -> ShortSeal:
+    def answer_seal(self, attachment: bytes) -> ShortSeal:
         """The seal of an answer under this key; raises SealError."""
         if self.is_terse and len(attachment) == MAC_BYTES:
             return ShortSeal("answer", attachment)
         return ShortSeal.decode(attachment)
 
-    def read_terse(self, seal: TerseSeal, what: ShortWhat) -> ShortSeal:
+    def in_full(self, seal: TerseSeal, what: ShortWhat) -> ShortSeal:
         """The seal of a question or a notice in full, if it is under this key; raises SealError."""
         with self._lock:
             newest = self._newest
@@ -328,7 +328,7 @@ def under_terse(alike: Sequence[AgreedKey], seal: TerseSeal, what: ShortWhat, ke
         return alike[0]
     payload_sha = sha256(payload).digest() if alike else b""
     for one in alike:
-        if one.has_made(one.read_terse(seal, what), key, payload_sha):
+        if one.has_made(one.in_full(seal, what), key, payload_sha):
             return one
     raise SealError(f"the terse seal of a {what} under a key that is not known here")
 

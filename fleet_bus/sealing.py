@@ -245,7 +245,7 @@ class Sealing:
         if is_terse(attachment):
             terse = TerseSeal.decode(attachment)
             of_key = under_terse(self._granted.find_alike(terse.terse_id), terse, "question", key, payload)
-            seal = of_key.read_terse(terse, "question")
+            seal = of_key.in_full(terse, "question")
         else:
             seal = ShortSeal.decode(attachment)
         agreed = self._granted.find(seal.key_id) if seal.what == "question" else None
@@ -283,7 +283,7 @@ class Sealing:
         agreed = sealed.agreed
         if agreed is None or agreed.other is None:
             raise SealError("a short seal on the answer to a question that was signed")
-        seal = agreed.read_answer(attachment)
+        seal = agreed.answer_seal(attachment)
         if seal.what not in ("answer", "refusal"):
             raise SealError(f"the short seal of a {seal.what} on an answer")
         agreed.check_answer(seal, key, payload, sealed.digest)
@@ -325,7 +325,7 @@ class Sealing:
         if is_terse(attachment):
             terse = TerseSeal.decode(attachment)
             of_key = under_terse(self._held.find_alike(terse.terse_id), terse, "notice", key, payload)
-            seal = of_key.read_terse(terse, "notice")
+            seal = of_key.in_full(terse, "notice")
         else:
             seal = ShortSeal.decode(attachment)
         if seal.what != "notice" or _chunk(key, 2) not in TO_ONE:

@@ -49,8 +49,8 @@ WORD: Final = KilometreMessage("word", 0, 28)
 _QUESTIONS: Final = tuple(KilometreMessage("question", up, down) for up, down in ((153, 77), (155, 52)))
 """At the start, and after 120 s; in a faster drive, instead of the second one, where the next district comes near."""
 KILOMETRE: Final = (*_QUESTIONS, *_REPORTS, *_TELEMETRY)
-"""Payload bytes as the ledger of `gnd reproduce steady-vehicle --length 1000 --pace 2 --secure --met` (seed 201) has them
-of a drive that took 182 s, without the report that the end of the drive makes; acks as they are without identities."""
+"""Payload bytes as the ledger of `gnd reproduce steady-vehicle --length 1000 --pace 2 --secure --met` (seed 201) has
+them, of a drive that took 182 s, without the report that its end makes; acks as they are without identities."""
 KILOMETRE_APART: Final = (
     *(KilometreMessage("question", up, down) for up, down in ((87, 53), (89, 36), (42, 6))),
     *_REPORTS,
