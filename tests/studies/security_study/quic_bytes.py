@@ -1,6 +1,6 @@
 """What a kilometre costs over QUIC, TLS and TCP as zenoh has them, by the packets on a loopback of its own.
 
-    unshare -n sh -c 'ip link set lo up; python -m studies.security_study.quic_bytes'
+    unshare -n sh -c 'ip link set lo up; PYTHONPATH=. python tests/studies/security_study/quic_bytes.py'
 
 UDP has no counters of a connection, so packets are read from the interface, which nobody else may use (Linux, root).
 These are messages of zenoh alone, without seals, and keep-alives as zenoh sends them by itself.
