@@ -37,7 +37,7 @@ from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upl
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
 from gnd.schemas.survey import SurveyReport
-from gnd.tile_store.errors import DistrictElsewhere, IdTaken, ImpossiblePlace, StoreDamaged, StoreError
+from gnd.tile_store.errors import BodiesAway, DistrictElsewhere, IdTaken, ImpossiblePlace, StoreDamaged, StoreError
 from gnd.tile_store.places import ReportPlace
 from gnd.tile_store.store import Store
 from gnd.tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
@@ -104,8 +104,9 @@ class Expander:
         """Whose it was, where that was found out."""
         try:
             outcome = self._settled(self._understood(claim))
-        except StoreDamaged as error:  # the store's fault, not the upload's: it waits until the page is mended
-            _LOG.error("upload %s waits: %s", claim.upload.report_id, error)
+        # the store's fault, not the upload's: it waits until the page is mended, or the bodies can be read
+        except (StoreDamaged, BodiesAway) as error:
+            _SELDOM.warning("upload %s waits: %s", claim.upload.report_id, error)
             self._store.postpone_upload(claim, DAMAGED_RETRY_S, blameless=True)
             return ""
         except DistrictElsewhere as error:  # it went with its district: the other store looks at it

@@ -15,6 +15,7 @@ from gnd.cloud_merger.snapping import REMEMBERED_TILES, Snapping
 from gnd.cloud_merger.statements import Report
 from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window
 from gnd.cloud_merger.window import MergedWindow, TileState, WindowMerger, fold, provenance_of
+from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import Feature, FeatureTile, is_feature_layer
@@ -22,7 +23,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
-from gnd.tile_store.errors import DistrictElsewhere, StoreDamaged, StoreError, UnknownReports
+from gnd.tile_store.errors import BodiesAway, DistrictElsewhere, StoreDamaged, StoreError, UnknownReports
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import (
     QUARANTINED,
@@ -37,6 +38,7 @@ from gnd.tile_store.values import (
 )
 
 _LOG = logging.getLogger(__name__)
+_SELDOM = Seldom(_LOG)
 T = TypeVar("T")
 StateT = TypeVar("StateT")
 ReportsT = TypeVar("ReportsT")
@@ -97,6 +99,10 @@ class Worker:
             DistrictElsewhere,
         ):  # one of them is to blame; any other is the store's failure
             return [None if one is None else self._published(one) for one in attempted]
+        except BodiesAway as error:
+            for one in publications:
+                self._bodies_away(one.claim, error)
+            return [None] * len(attempted)
         return [None if one is None else next(results) for one in attempted]
 
     def _published(self, publication: Publication) -> PublishResult | None:
@@ -107,6 +113,9 @@ class Worker:
             return None
         except (StoreDamaged, UnknownReports) as error:
             self._failed(publication.claim, error)
+            return None
+        except BodiesAway as error:
+            self._bodies_away(publication.claim, error)
             return None
         return result
 
@@ -135,6 +144,8 @@ class Worker:
             )  # before the tile is read: the store refuses what both together do not fit
             work = self._store.load(claim)
             return self._of_features(work) if is_feature_layer(claim.layer) else self._of_gaussians(work, named)
+        except BodiesAway as error:
+            self._bodies_away(claim, error)
         except StoreError as error:
             if not isinstance(error, StoreDamaged):
                 raise  # the store's failure, not the tile's
@@ -142,6 +153,11 @@ class Worker:
         except Exception as error:
             self._failed(claim, error)
         return None
+
+    def _bodies_away(self, claim: Claim, error: BodiesAway) -> None:
+        """Try again later, for as long as it takes: it is not the tile's fault."""
+        _SELDOM.warning("%s is not merged now: %s", claim.tile, error)
+        self._store.postpone(claim, RETRY_S, blameless=True)
 
     def _failed(self, claim: Claim, error: Exception) -> None:
         """Try again later, not for ever."""

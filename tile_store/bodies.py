@@ -11,11 +11,12 @@ import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
 from gnd.tile_store.connection import SqlConnection, change, fetch
-from gnd.tile_store.errors import StoreDamaged, StoreError
+from gnd.tile_store.errors import BodiesAway, StoreDamaged, StoreError, StoreUnavailable
 from gnd.tile_store.memory import Memory
 from gnd.tile_store.objects import NamedObjects, ObjectSeen, check_creates, open_objects
 from gnd.tile_store.values import NS_PER_S, Content
@@ -51,12 +52,13 @@ class Bodies:
         """Put bodies there; the same contents, which say since when they are.
 
         Raises:
-            StoreUnavailable: the objects cannot be written.
+            BodiesAway: the objects cannot be written.
         """
 
         def put(content: Content) -> Content:
             began_s = time.monotonic()
-            self.objects.put_new(body_name(content.sha, content.codec_id), content.body)
+            with _away():
+                self.objects.put_new(body_name(content.sha, content.codec_id), content.body)
             return replace(content, kept_s=began_s)
 
         if len(contents) < 2:
@@ -69,17 +71,26 @@ class Bodies:
 
         Raises:
             StoreDamaged: there is none.
-            StoreUnavailable: the objects cannot be read.
+            BodiesAway: the objects cannot be read.
         """
         name = body_name(sha, codec_id)
 
         def from_objects() -> bytes:
-            body = self.objects.get(name)
+            with _away():
+                body = self.objects.get(name)
             if body is None:
                 raise StoreDamaged(f"{self.objects.location}: {name}, the body of a version, is not there")
             return body
 
         return self._memory.get(name, from_objects)
+
+
+@contextmanager
+def _away() -> Iterator[None]:
+    try:
+        yield
+    except StoreUnavailable as error:
+        raise BodiesAway(str(error)) from error
 
 
 def place_of_bodies(c: SqlConnection) -> str | None:

@@ -232,9 +232,9 @@ def release(c: SqlConnection, owner: str) -> int:
     return change(c, "release_owner", {"owner": owner})
 
 
-def postpone(c: SqlConnection, claim: Claim, ready_ns: int) -> None:
-    """Free one lease; the tile is ready again at `ready_ns`."""
-    post(c, "release_token", _lease(claim) | {"ready_ns": ready_ns})
+def postpone(c: SqlConnection, claim: Claim, ready_ns: int, *, blameless: bool = False) -> None:
+    """Free one lease; the tile is ready again at `ready_ns`. Blameless: the attempt that was begun does not count."""
+    post(c, "release_token", _lease(claim) | {"ready_ns": ready_ns, "blameless": int(blameless)})
 
 
 def holds(c: SqlConnection, claim: Claim) -> bool:

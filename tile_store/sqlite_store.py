@@ -373,10 +373,13 @@ class SqlStore(ABC):
         """See `Store.release`."""
         return self._writer.run(lambda c: (inbox.release(c, owner), uploads.release(c, owner))[0])
 
-    def postpone(self, claim: Claim, delay_s: float) -> None:
+    def postpone(self, claim: Claim, delay_s: float, *, blameless: bool = False) -> None:
         """See `Store.postpone`."""
         self._writer.run(
-            lambda c: inbox.postpone(c, claim, self._steady_ns() + round(delay_s * NS_PER_S)), inbox.locks_of([claim])
+            lambda c: inbox.postpone(
+                c, claim, self._steady_ns() + round(delay_s * NS_PER_S), blameless=blameless
+            ),
+            inbox.locks_of([claim]),
         )
 
     def set_aside(self, claim: Claim, reason: str) -> bool:

@@ -148,8 +148,10 @@ class Store(Protocol):
     def release(self, owner: str) -> int:
         """Free all leases of an owner (it has died), those of uploads too; the number of tiles freed."""
 
-    def postpone(self, claim: Claim, delay_s: float) -> None:
-        """Give a tile back, to be ready again after `delay_s` (its merge has failed)."""
+    def postpone(self, claim: Claim, delay_s: float, *, blameless: bool = False) -> None:
+        """Give a tile back, to be ready again after `delay_s` (its merge has failed); blameless: the attempt that was
+        begun does not count.
+        """
 
     def dirty_count(self) -> int:
         """Tiles that wait to be merged, leased ones included, those set aside not."""

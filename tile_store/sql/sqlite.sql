@@ -645,7 +645,8 @@ UPDATE dirty SET lease_ns = :lease_ns WHERE layer = :layer AND tile = :tile AND 
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL WHERE owner = :owner
 
 -- name: release_token
-UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :ready_ns
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :ready_ns,
+  attempts = attempts - CASE WHEN :blameless <> 0 AND attempts > 0 THEN 1 ELSE 0 END
 WHERE layer = :layer AND tile = :tile AND token = :token
 
 -- name: dirty_row
