@@ -50,6 +50,7 @@ class ProcessSpec:
         restart: start it again when it ends with an exit code other than 0.
         namespace: the network namespace that it enters first of all; None stays in the launcher's.
         identity: its identity folder; None: it has none.
+        environment: variables that it has beside those of the launcher, and what it starts, too.
     """
 
     name: str
@@ -58,6 +59,7 @@ class ProcessSpec:
     restart: bool = True
     namespace: str | None = None
     identity: Path | None = None
+    environment: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(slots=True)
@@ -214,6 +216,7 @@ def _run_role(spec: ProcessSpec, log_path: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher turns Ctrl-C into an orderly end
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     _log_to(log_path)
+    os.environ.update(spec.environment)
     try:
         if spec.namespace is not None:
             enter_namespace(spec.namespace)  # before any thread of Zenoh's: threads are born where their maker is

@@ -21,6 +21,7 @@ from gnd.deploy.errors import LabError, LabRuns
 from gnd.deploy.lab.devices import link_commands
 from gnd.deploy.lab.groups import PREFIX, Group, LabLink, check_lab_name, links_of, namespace_name
 from gnd.deploy.lab.hosts.data import labs_with_data, remove_data
+from gnd.deploy.lab.hosts.slow_disk import labs_with_groups, remove_group
 from gnd.deploy.lab.namespaces import add_namespace, namespaces, pids_in, remove_namespace, run_all
 from gnd.deploy.lab.tools import Offer, check_offer, kernel_offer, needs_carrying
 
@@ -190,13 +191,14 @@ def clean() -> dict[str, tuple[str, ...]]:
     """Remove what killed labs have left behind; labs that run are left alone.
 
     Returns:
-        The removed namespaces, and the folder of databases, by lab; an empty tuple for a lab that runs.
+        The removed namespaces, the folder of databases and the group of a slow disk, by lab; an empty tuple for a lab
+        that runs.
     """
     done: dict[str, tuple[str, ...]] = {}
-    for name in sorted({*labs(), *labs_with_data()}):
+    for name in sorted({*labs(), *labs_with_data(), *labs_with_groups()}):
         try:
             with lab_lock(name):
-                done[name] = (*remove_all(name), *remove_data(name))
+                done[name] = (*remove_all(name), *remove_data(name), *remove_group(name))
         except LabRuns:
             done[name] = ()
     return done

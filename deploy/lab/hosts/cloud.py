@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.confirmation import ConfirmationParameters
@@ -15,8 +15,9 @@ from gnd.deploy import roles
 from gnd.deploy.chaos import clients
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.lab.groups import Group, LabLink, unpaced
+from gnd.deploy.lab.hosts.bucket import bucket_server
 from gnd.deploy.lab.hosts.database import DatabaseSide, database
-from gnd.deploy.lab.hosts.plan import DATABASES, HUB, WITNESS, WITNESS_PORT, HostsPlan
+from gnd.deploy.lab.hosts.plan import BUCKET, DATABASES, HUB, WITNESS, WITNESS_PORT, HostsPlan
 from gnd.deploy.lab.hosts.witness import witness
 from gnd.deploy.lab.lab import Lab
 from gnd.deploy.processes import ProcessSpec
@@ -25,7 +26,7 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusClosed, BusError
 from gnd.fleet_bus.links import LinkProfile
 from gnd.fleet_bus.router import run_router, wait_for_stop
-from gnd.schemas.keys import tile_key
+from gnd.schemas.keys import tile_key, update_keys
 from gnd.tile_store.location import StoreLocation, open_store
 from gnd.tile_store.server import TileServer
 
@@ -37,6 +38,7 @@ REPORTS_OF_TRIP: Final = 60
 """Each outbox is looked at five times a second as long as one of its reports is not released."""
 ASK_EVERY_S: Final = 0.1
 ASK_S: Final = 20.0
+HEARD_SUFFIX: Final = ".heard"
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,14 @@ def database_processes(plan: HostsPlan, folders: LabFolders) -> list[ProcessSpec
     return [ProcessSpec(WITNESS, witness, args, namespace=plan.host_of(WITNESS).namespace), *specs]
 
 
+def bucket_processes(plan: HostsPlan, folders: LabFolders) -> list[ProcessSpec]:
+    """The S3 server, if there is one."""
+    if not plan.size.has_bucket:
+        return []
+    host = plan.host_of(BUCKET)
+    return [ProcessSpec(BUCKET, bucket_server, (host.address, folders.data / BUCKET), namespace=host.namespace)]
+
+
 def cloud_processes(plan: HostsPlan) -> list[ProcessSpec]:
     """The hub, and each region's router, tile server and shard."""
     specs = [ProcessSpec(HUB, lab_router, (plan.hub, ()), namespace=plan.host_of(HUB).namespace)]
@@ -150,7 +160,10 @@ def client_processes(plan: HostsPlan, lab: Lab, folders: LabFolders, seed: int, 
         for name, link in zip(client_names(plan, region), links_of_region(plan, lab, region), strict=True):
             session, times = unpaced(link.profile), folders.times / f"{name}.times"
             if name.startswith("asker"):
-                spec = ProcessSpec(name, asker, (routers, session, name, times), namespace=link.vehicle_namespace)
+                heard = folders.times / f"{name}{HEARD_SUFFIX}"
+                spec = ProcessSpec(
+                    name, asker, (routers, session, name, times, heard), namespace=link.vehicle_namespace
+                )
             else:
                 task = clients.ChaosVehicleTask(
                     routers, name, folders.vehicles, seed, every_s, session, times, REPORTS_OF_TRIP
@@ -172,11 +185,18 @@ def lab_tiles(location: StoreLocation, connect: tuple[str, ...], *, stop: thread
         wait_for_stop(stop)
 
 
-def asker(connect: tuple[str, ...], link: LinkProfile, name: str, times: Path, *, stop: threading.Event) -> None:
-    """Ask for one tile after the other, and note when each came."""
+def asker(
+    connect: tuple[str, ...], link: LinkProfile, name: str, times: Path, heard: Path, *, stop: threading.Event
+) -> None:
+    """Ask for one tile after the other, and note when each came, and when a new version was heard of."""
     street, rng = read_street(), random.Random(name)
     config = BusConfig(connect=connect, link=link, patient=True)
-    with open_bus(config, name=name) as bus, times.open("a", encoding="utf-8") as file:
+    with (
+        times.open("a", encoding="utf-8") as file,
+        heard.open("a", encoding="utf-8") as notices,
+        open_bus(config, name=name) as bus,
+        bus.subscribe(update_keys(LAYER), lambda _key, _payload: _note(notices)),
+    ):
         while not stop.wait(ASK_EVERY_S):
             try:
                 bus.request(tile_key(LAYER, rng.choice(street.tiles).tile_id), b"", kind="tile", timeout_s=ASK_S)
@@ -184,8 +204,12 @@ def asker(connect: tuple[str, ...], link: LinkProfile, name: str, times: Path, *
                 return
             except BusError:  # no answer while something is down: the next one
                 continue
-            file.write(f"{time.monotonic():.4f}\n")
-            file.flush()
+            _note(file)
+
+
+def _note(file: TextIO) -> None:
+    file.write(f"{time.monotonic():.4f}\n")
+    file.flush()
 
 
 def read_times(files: Iterable[Path]) -> list[float]:

@@ -2,6 +2,8 @@
 
 import json
 import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +14,7 @@ from gnd.deploy.errors import LabError
 from gnd.deploy.interruption import ending_in_order
 from gnd.deploy.lab.hosts.data import data_folder
 from gnd.deploy.lab.hosts.network import build_network
-from gnd.deploy.lab.hosts.plan import HostsPlan, HostsSize, plan_hosts
+from gnd.deploy.lab.hosts.plan import BUCKET, HostsPlan, HostsSize, plan_hosts
 from gnd.deploy.lab.hosts.tables import hosts_verdict, print_hosts
 from gnd.deploy.lab.lab import open_lab
 from gnd.deploy.lab.tools import check_rights
@@ -32,11 +34,14 @@ SIZE: Final = HostsSize()
 @click.option("--regions", type=int, default=SIZE.regions, show_default=True, help="Each: router, tile server, shard.")
 @click.option("--hosts", "count", type=int, default=SIZE.hosts, show_default=True, help="Machines, 2 or more.")
 @click.option("--vehicles", type=int, default=SIZE.vehicles, show_default=True, help="Of each region.")
+@click.option("--bucket", is_flag=True, help="Bodies of tiles lie in a bucket of S3 on one of the hosts.")
 @click.option("--link", default="5g", show_default=True, help="Link of each vehicle: a profile or a TOML file.")
 @click.option("--faults", help="With commas, in order; all: each one.  [default: the loss of hosts, and a partition]")
 @click.option("--times", type=click.IntRange(1, 100), default=1, show_default=True, help="How often the list is done.")
 @click.option("--away", type=float, default=10.0, show_default=True, help="How long what is lost stays away, s.")
 @click.option("--cut", type=float, default=60.0, show_default=True, help="How long a region is cut off, s.")
+@click.option("--writes", type=int, default=5, show_default=True, help="A slow disk makes so many a second.")
+@click.option("--clock", type=float, default=600.0, show_default=True, help="A wrong clock is wrong by so much, s.")
 @click.option("--every", type=float, default=0.5, show_default=True, help="A vehicle's reports are so far apart, s.")
 @click.option("--gap", type=float, default=5.0, show_default=True, help="Allowed time without service, s.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Draws the reports.")
@@ -52,15 +57,17 @@ def hosts(regions: int, count: int, vehicles: int, link: str, faults: str | None
     a region was not served for longer than --gap. Ctrl-C ends the faults; all up to then is checked and printed.
     Needs root, iproute2 and the programs of a PostgreSQL server.
     """
-    plan, profile = plan_hosts(options["name"], HostsSize(regions, count, vehicles)), load_link(link)
+    size = HostsSize(regions, count, vehicles, options["bucket"])
+    plan, profile = plan_hosts(options["name"], size), load_link(link)
     need_all()
     from gnd.deploy.lab.hosts.faults import chosen_faults
     from gnd.deploy.lab.hosts.run import HostsOptions
 
     chosen = chosen_faults(faults, plan) * times
     run_options = HostsOptions(
-        chosen, options["seed"], options["every"], options["away"], options["cut"], options["gap"]
-    )
+        chosen, options["seed"], options["every"], options["away"], options["cut"], options["gap"], options["writes"],
+        options["clock"],
+    )  # fmt: skip
     check_rights()
     folder = _folder(options["out"])
     outcome = _run(plan, profile, run_options, folder)
@@ -94,7 +101,11 @@ def _run(plan: HostsPlan, profile: LinkProfile, options: "HostsOptions", folder:
     server_programs()
     server_user()
     name = plan.hosts[0].lab
-    with ending_in_order() as stop, progress_bars(Console(stderr=True)) as progress:
+    with (
+        ending_in_order() as stop,
+        _surroundings(plan, options, folder),
+        progress_bars(Console(stderr=True)) as progress,
+    ):
         start_fork_server()
         task = progress.add_task("starting", total=len(options.faults))
         with open_lab(name, link_groups(plan, profile)) as lab, data_folder(name) as data:
@@ -105,3 +116,18 @@ def _run(plan: HostsPlan, profile: LinkProfile, options: "HostsOptions", folder:
                 plan, lab, folders, options, stop,
                 lambda what, n: progress.update(task, description=what, completed=n),
             )  # fmt: skip
+
+
+@contextmanager
+def _surroundings(plan: HostsPlan, options: "HostsOptions", folder: Path) -> Iterator[None]:
+    """What all processes of the laboratory find in their environment."""
+    from gnd.deploy.lab.hosts.bucket import bucket_environment, server_program
+    from gnd.deploy.lab.hosts.wrong_clock import clocks_may_be_wrong
+
+    with ExitStack() as stack:
+        if plan.size.has_bucket:
+            server_program()
+            stack.enter_context(bucket_environment(plan.host_of(BUCKET).address))
+        if any(fault.is_of_clocks for fault in options.faults):
+            stack.enter_context(clocks_may_be_wrong(folder))
+        yield

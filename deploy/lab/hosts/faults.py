@@ -11,11 +11,13 @@ from typing import Final, Literal
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.hosts.cloud import links_of_region, state_of_witness
 from gnd.deploy.lab.hosts.network import LabEnd, lose_between
-from gnd.deploy.lab.hosts.plan import DATABASES, HostsPlan, LabHost
+from gnd.deploy.lab.hosts.plan import BUCKET, DATABASES, HostsPlan, LabHost
 from gnd.deploy.lab.hosts.running import HostsCloud
+from gnd.deploy.lab.hosts.slow_disk import disk_of, groups_of_disks, slow_disk
+from gnd.deploy.lab.hosts.wrong_clock import library
 from gnd.deploy.lab.namespaces import pids_in
 
-Way = Literal["process", "host", "silent", "partition", "one-way"]
+Way = Literal["process", "host", "silent", "partition", "one-way", "disk", "clock", "drift"]
 GONE_WITHIN_S: Final = 30.0
 _LOOK_S: Final = 0.01
 
@@ -29,8 +31,10 @@ class HostFault:
     Attributes:
         name: as the command and the report name it.
         way: a process is killed; all processes of a host; or the host falls silent, as one without power. Or a region
-            is cut off from all others, or what it sends is lost and what it is sent arrives.
-        part: whose process or host it is; "primary", "standby": whoever is it then. Of the last region; "" none.
+            is cut off from all others, or what it sends is lost and what it is sent arrives. A host's disk is slow,
+            its clock is wrong, or the clocks of a region's hosts are fast.
+        part: whose process or host it is; "primary", "standby": whoever is it then. Of the last
+            region, where it has one; "" none.
     """
 
     name: str
@@ -41,6 +45,29 @@ class HostFault:
     def is_cut(self) -> bool:
         """Whether a region cannot be served while it lasts."""
         return self.way in ("partition", "one-way")
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it lasts as long as a region is cut off."""
+        return self.is_cut or self.way == "drift"
+
+    @property
+    def is_of_clocks(self) -> bool:
+        """Whether clocks are wrong while it lasts."""
+        return self.way in ("clock", "drift")
+
+
+@dataclass(frozen=True, slots=True)
+class HowMuch:
+    """How much is done where a fault can be small or large.
+
+    Attributes:
+        writes_per_s: that a slow disk makes.
+        clock_s: by which a wrong clock is wrong, s.
+    """
+
+    writes_per_s: int
+    clock_s: float
 
 
 FAULTS: Final = (
@@ -55,8 +82,18 @@ FAULTS: Final = (
     HostFault("standby-host", "host", "standby"),
     HostFault("silent-shard-host", "silent", "shard"),
     HostFault("silent-database-host", "silent", "primary"),
+    HostFault("bucket", "process", BUCKET),
+    HostFault("bucket-host", "host", BUCKET),
+    HostFault("silent-bucket-host", "silent", BUCKET),
     HostFault("partition", "partition"),
     HostFault("one-way", "one-way"),
+    HostFault("slow-disk", "disk", "primary"),
+    HostFault("slow-standby-disk", "disk", "standby"),
+    HostFault("clock-router-host", "clock", "router"),
+    HostFault("clock-tiles-host", "clock", "tiles"),
+    HostFault("clock-shard-host", "clock", "shard"),
+    HostFault("clock-database-host", "clock", "primary"),
+    HostFault("drift", "drift"),
 )
 BY_FAULT: Final = {fault.name: fault for fault in FAULTS}
 DEFAULT_FAULTS: Final = "router-host,tiles-host,shard-host,database-host,partition"
@@ -86,6 +123,8 @@ def chosen_faults(text: str | None, plan: HostsPlan) -> tuple[HostFault, ...]:
     if text is None:
         return tuple(fault for fault in parse_faults(DEFAULT_FAULTS) if not why_not_survived(fault, plan))
     faults = parse_faults(text)
+    if faults == FAULTS:  # all that there can be here
+        faults = tuple(fault for fault in faults if not _lacks(fault, plan))
     for fault in faults:
         if why := why_not_survived(fault, plan):
             raise LabError(f"fault {fault.name}: {why}")
@@ -94,26 +133,47 @@ def chosen_faults(text: str | None, plan: HostsPlan) -> tuple[HostFault, ...]:
 
 def why_not_survived(fault: HostFault, plan: HostsPlan) -> str:
     """What this laboratory lacks; empty: nothing."""
+    if lacks := _lacks(fault, plan):
+        return lacks
     is_database = fault.part in ("primary", "standby")
+    if fault.way in ("disk", "clock", "drift"):
+        return ""
     if is_database and not plan.has_witness:
         return "the loss of a database host needs a third host, which decides who goes on"
-    if not is_database and plan.size.regions < 2:
+    if not is_database and fault.part != BUCKET and plan.size.regions < 2:
         return "needs 2 regions, so that the other one goes on"
     if fault.way in ("host", "silent") and not plan.has_witness and set(DATABASES) & _parts_of_host(fault, plan):
         return "its host has a database, and there is no third host, which decides who goes on"
     return ""
 
 
+def _lacks(fault: HostFault, plan: HostsPlan) -> str:
+    """What this laboratory or this machine lacks; empty: nothing."""
+    if fault.part == BUCKET and not plan.size.has_bucket:
+        return "there is no bucket (--bucket)"
+    try:
+        if fault.is_of_clocks:
+            library()
+        elif fault.way == "disk":
+            groups_of_disks()
+    except LabError as error:
+        return str(error)
+    return ""
+
+
 def _parts_of_host(fault: HostFault, plan: HostsPlan) -> set[str]:
-    return set(plan.host_of(f"{fault.part}-{plan.size.regions - 1}").parts)
+    name = fault.part if fault.part == BUCKET else f"{fault.part}-{plan.size.regions - 1}"
+    return set(plan.host_of(name).parts)
 
 
-def begin_fault(cloud: HostsCloud, fault: HostFault) -> tuple[str, End]:
+def begin_fault(cloud: HostsCloud, fault: HostFault, how_much: HowMuch) -> tuple[str, End]:
     """Do it.
 
     Returns:
         What was hit, in words, and how to end it.
     """
+    if fault.way == "drift":
+        return _drift(cloud)
     if fault.is_cut:
         return _cut(cloud, both=fault.way == "partition")
     part = _part(cloud, fault.part)
@@ -121,6 +181,11 @@ def begin_fault(cloud: HostsCloud, fault: HostFault) -> tuple[str, End]:
     if fault.way == "process":
         cloud.lose((part,))
         return f"{part} on {host.name}", lambda: cloud.give_back((part,))
+    if fault.way == "disk":
+        return _slow(cloud, host, how_much.writes_per_s)
+    if fault.way == "clock":
+        end_clock = cloud.host_clocks.step(host, offset_s=how_much.clock_s)
+        return f"{how_much.clock_s:+g} s at {host.name}: {', '.join(host.parts)}", end_clock
     undo = _silence(cloud, host) if fault.way == "silent" else _nothing
     cloud.lose(host.parts, lambda: kill_all(host))  # at once: who outlives its router would go to another one
 
@@ -132,6 +197,8 @@ def begin_fault(cloud: HostsCloud, fault: HostFault) -> tuple[str, End]:
 
 
 def _part(cloud: HostsCloud, part: str) -> str:
+    if part == BUCKET:
+        return part
     if part not in ("primary", "standby"):
         return f"{part}-{cloud.plan.size.regions - 1}"
     state = state_of_witness(cloud.folders) or {"primary": DATABASES[0]}
@@ -146,6 +213,18 @@ def _cut(cloud: HostsCloud, *, both: bool) -> tuple[str, End]:
     others = [end for other in rest for end in _ends(cloud, other)]
     undo = _lose(cloud, inside, others, both=both)
     return f"region {region}: {', '.join(host.name for host in own)}", undo
+
+
+def _drift(cloud: HostsCloud) -> tuple[str, End]:
+    """The clocks of the last region's hosts."""
+    own = cloud.plan.in_region(cloud.plan.size.regions - 1)
+    return f"1 s a minute at {', '.join(host.name for host in own)}", cloud.host_clocks.drift(*own)
+
+
+def _slow(cloud: HostsCloud, host: LabHost, writes_per_s: int) -> tuple[str, End]:
+    """The disk of all that runs on a host."""
+    end = slow_disk(cloud.lab.name, disk_of(cloud.folders.data), pids_in(host.namespace), writes_per_s)
+    return f"{writes_per_s} writes a second at {host.name}: {', '.join(host.parts)}", end
 
 
 def _nothing() -> None:

@@ -13,12 +13,14 @@ MOST_VEHICLES: Final = 50
 DATABASES: Final = ("database-a", "database-b")
 WITNESS: Final = "witness"
 HUB: Final = "hub"
+BUCKET: Final = "bucket"
 OF_REGION: Final = ("router", "tiles", "shard")
 """What every region has."""
 ROUTER_PORT: Final = 7447
 HUB_PORT: Final = 7448
 DATABASE_PORT: Final = 5432
 WITNESS_PORT: Final = 5433
+BUCKET_PORT: Final = 8333
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +31,13 @@ class HostsSize:
         regions: at least 1; each has a router, a tile server and a shard.
         hosts: at least 2, and one for each region.
         vehicles: of each region.
+        has_bucket: whether the bodies of tiles lie in a bucket on one of the hosts, not in the database.
     """
 
     regions: int = 2
     hosts: int = 4
     vehicles: int = 2
+    has_bucket: bool = False
 
     def __post_init__(self) -> None:
         if not 2 <= self.hosts <= MOST_HOSTS:
@@ -145,7 +149,8 @@ def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:
     Hosts are shared out among the regions in order. The database's two sides come first, in the first region where it
     has two hosts; then what belongs to a region, each on the host of its region that has least to do and no database
     if there is one; the hub beside the last region's router, so that no tile server is lost with the way to the
-    others; a witness where least is to do and no database is. Without a third host there is no witness.
+    others; a bucket, if there is one, and a witness where least is to do and no database is. Without a third host there
+    is no witness.
 
     Args:
         lab: name of the laboratory.
@@ -161,6 +166,8 @@ def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:
         own = [number for number, where in enumerate(regions) if where == region]
         placed += _spread([f"{part}-{region}" for part in OF_REGION], own, placed)
     placed.append((HUB, dict(placed)[f"router-{size.regions - 1}"]))
+    if size.has_bucket:
+        placed += _spread([BUCKET], range(size.hosts), placed)
     if size.hosts > len(DATABASES):
         placed += _spread([WITNESS], range(len(DATABASES), size.hosts), placed)
     hosts = (

@@ -13,8 +13,8 @@ from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
 from gnd.deploy.chaos.run import HURRIED_S
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.errors import LabError
-from gnd.deploy.lab.hosts.cloud import LabFolders, client_names, read_times
-from gnd.deploy.lab.hosts.faults import HostFault, begin_fault, is_back
+from gnd.deploy.lab.hosts.cloud import HEARD_SUFFIX, LabFolders, client_names, read_times
+from gnd.deploy.lab.hosts.faults import HostFault, HowMuch, begin_fault, is_back
 from gnd.deploy.lab.hosts.plan import HostsPlan
 from gnd.deploy.lab.hosts.running import HostsCloud, running_hosts
 from gnd.deploy.lab.hosts.verdict import LONGEST_GAP_S, HostsOutcome, HostTrial
@@ -30,6 +30,8 @@ BACK_S: Final = 90.0
 CALM_S: Final = 5.0
 SETTLE_S: Final = 900.0
 SERVED_LATELY_S: Final = 1.5
+MOST_WRITES: Final = 10_000
+MOST_CLOCK_S: Final = 1e8
 _LOOK_S: Final = 0.2
 
 OnHostsStep = Callable[[str, int], None]
@@ -47,6 +49,8 @@ class HostsOptions:
         away_s: how long what is lost stays away, s.
         partition_s: how long a region is cut off, s.
         longest_gap_s: allowed without service, s.
+        writes_per_s: that a slow disk makes.
+        clock_s: by which a wrong clock is wrong, s.
     """
 
     faults: tuple[HostFault, ...]
@@ -55,11 +59,22 @@ class HostsOptions:
     away_s: float = 10.0
     partition_s: float = 60.0
     longest_gap_s: float = LONGEST_GAP_S
+    writes_per_s: int = 5
+    clock_s: float = 600.0
 
     def __post_init__(self) -> None:
         for name in ("every_s", "away_s", "partition_s", "longest_gap_s"):
             if not 0.05 <= getattr(self, name) <= 3600:
                 raise LabError(f"{name} must be 0.05 to 3600, got {getattr(self, name)}")
+        if not 1 <= self.writes_per_s <= MOST_WRITES:
+            raise LabError(f"writes_per_s must be 1 to {MOST_WRITES}, got {self.writes_per_s}")
+        if not 1.0 <= abs(self.clock_s) <= MOST_CLOCK_S:
+            raise LabError(f"clock_s must be 1 to {MOST_CLOCK_S:g} or minus that, got {self.clock_s}")
+
+    @property
+    def how_much(self) -> HowMuch:
+        """How much is done."""
+        return HowMuch(self.writes_per_s, self.clock_s)
 
 
 def run_hosts(
@@ -89,7 +104,14 @@ def run_hosts(
     street = read_street(districts=max(2, plan.size.regions))
     with (
         inside(lab.cloud_namespace),
-        running_hosts(plan, lab, folders, street, (options.seed, options.every_s)) as cloud,
+        running_hosts(
+            plan,
+            lab,
+            folders,
+            street,
+            (options.seed, options.every_s),
+            has_clocks=any(fault.is_of_clocks for fault in options.faults),
+        ) as cloud,
     ):
         course = _Course(cloud, options, stop, on_step)
         course.wait_for_work()
@@ -158,9 +180,9 @@ class _Course:
 
     def _inflict(self, fault: HostFault) -> HostTrial:
         began_s = time.monotonic()
-        where, end = begin_fault(self._cloud, fault)
+        where, end = begin_fault(self._cloud, fault, self._options.how_much)
         try:
-            self._stop.wait(self._options.partition_s if fault.is_cut else self._options.away_s)
+            self._stop.wait(self._options.partition_s if fault.is_long else self._options.away_s)
         finally:
             ended_s = time.monotonic()
             end()
@@ -185,7 +207,8 @@ class _Course:
         names = [client_names(self._cloud.plan, region) for region in self._regions]
         acks_s = [read_times(map(self._file, own[:-1])) for own in names]
         tiles_s = [read_times(map(self._file, own[-1:])) for own in names]
-        return HostTrial(fault, where, *span_s, until_s, is_cut, len(names) - 1, acks_s, tiles_s)
+        versions_s = [read_times([self._file(own[-1]).with_suffix(HEARD_SUFFIX)]) for own in names]
+        return HostTrial(fault, where, *span_s, until_s, is_cut, len(names) - 1, acks_s, tiles_s, versions_s)
 
     @property
     def _regions(self) -> range:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import psutil
@@ -14,8 +14,10 @@ import psycopg
 
 from gnd.deploy.chaos.street import LAYER, ChaosStreet
 from gnd.deploy.errors import LabError
+from gnd.deploy.lab.hosts.bucket import PLACE, make_bucket
 from gnd.deploy.lab.hosts.cloud import (
     LabFolders,
+    bucket_processes,
     client_processes,
     cloud_processes,
     database_processes,
@@ -23,6 +25,7 @@ from gnd.deploy.lab.hosts.cloud import (
 )
 from gnd.deploy.lab.hosts.plan import DATABASE_PORT, DATABASES, HostsPlan
 from gnd.deploy.lab.hosts.postgres import DATABASE, OWNER
+from gnd.deploy.lab.hosts.wrong_clock import HostClocks
 from gnd.deploy.lab.lab import Lab
 from gnd.deploy.lab.run import relay_processes
 from gnd.deploy.processes import ProcessSpec, Supervisor
@@ -31,6 +34,7 @@ from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import PLAIN_VARIABLE, BusConfig
 from gnd.gnd_map.errors import GndError
 from gnd.schemas.keys import tile_key
+from gnd.tile_store.bodies import move_out
 from gnd.tile_store.location import open_store
 
 READY_S: Final = 300.0
@@ -48,6 +52,7 @@ class HostsCloud:
         lab: namespaces and links.
         folders: where it writes.
         supervisor: starts again what dies.
+        clocks: of the hosts; None: all are right.
         died: why the supervisor has given up, if it has.
     """
 
@@ -55,16 +60,32 @@ class HostsCloud:
     lab: Lab
     folders: LabFolders
     supervisor: Supervisor
+    clocks: HostClocks | None = None
     died: list[str] = field(default_factory=list)
     _specs: dict[str, ProcessSpec] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def host_clocks(self) -> HostClocks:
+        """The clocks of the hosts.
+
+        Raises:
+            LabError: none may be wrong in this run.
+        """
+        if self.clocks is None:
+            raise LabError("the clocks of this laboratory cannot be set")
+        return self.clocks
 
     def start(self, specs: Iterable[ProcessSpec]) -> None:
         """Start parts; they are started again when they die."""
         with self._lock:
             for spec in specs:
-                self._specs[spec.name] = spec
-                self.supervisor.start(spec)
+                self._specs[spec.name] = self._by_its_clock(spec)
+                self.supervisor.start(self._specs[spec.name])
+
+    def _by_its_clock(self, spec: ProcessSpec) -> ProcessSpec:
+        own = [host for host in self.plan.hosts if spec.name in host.parts]
+        return replace(spec, environment=self.clocks.environment(own[0])) if self.clocks and own else spec
 
     def lose(self, parts: Iterable[str], first: Callable[[], None] = lambda: None) -> None:
         """Kill parts with all that they have started; they stay away. `first` comes before, and nothing between."""
@@ -113,7 +134,13 @@ def _children(pid: int) -> list[psutil.Process]:
 
 @contextmanager
 def running_hosts(
-    plan: HostsPlan, lab: Lab, folders: LabFolders, street: ChaosStreet, clients: tuple[int, float]
+    plan: HostsPlan,
+    lab: Lab,
+    folders: LabFolders,
+    street: ChaosStreet,
+    clients: tuple[int, float],
+    *,
+    has_clocks: bool = False,
 ) -> Iterator[HostsCloud]:
     """Start database, routers, tile servers, shards and clients, end all with the block.
 
@@ -125,6 +152,7 @@ def running_hosts(
         folders: made.
         street: the map that is published first.
         clients: seed of the reports, and how often a vehicle has one, s.
+        has_clocks: whether the hosts' clocks may be set wrong, within `clocks_may_be_wrong`.
 
     Raises:
         LabError: the database does not become ready.
@@ -134,12 +162,16 @@ def running_hosts(
         stack.enter_context(_plain())
         supervisor = Supervisor(folders.logs, folders.root / "pids.json")
         stack.callback(supervisor.stop)
-        cloud = HostsCloud(plan, lab, folders, supervisor)
+        clocks = HostClocks(folders.data / "clocks") if has_clocks else None
+        cloud = HostsCloud(plan, lab, folders, supervisor, clocks)
         cloud.start(relay_processes(lab, folders.relays))
-        cloud.start(database_processes(plan, folders))
+        cloud.start([*database_processes(plan, folders), *bucket_processes(plan, folders)])
         _make_database(plan)
         with open_store(plan.database_url) as store:
             store.put_tiles(street.tiles)
+            if plan.size.has_bucket:
+                make_bucket()
+                move_out(store, PLACE)
         _until(lambda: _has_standby(cloud), "the standby follows")
         cloud.start(cloud_processes(plan))
         with open_bus(BusConfig(connect=(plan.hub,), open_timeout_s=READY_S), name="probe") as bus:

@@ -1,12 +1,14 @@
 """The outcome of a run over hosts as tables."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
     from gnd.deploy.lab.hosts.verdict import HostsOutcome
+
+_TIMES: Final = ("no ack for, s", "no tile for, s", "no new version for, s", "back after, s")
 
 
 def print_hosts(console: Console, outcome: "HostsOutcome") -> None:
@@ -15,16 +17,16 @@ def print_hosts(console: Console, outcome: "HostsOutcome") -> None:
     for name, parts in outcome.plan.items():
         places.add_row(name, ", ".join(parts) or "nothing")
     console.print(places)
-    table = Table(
-        "fault", "hit", "lasted, s", "acks", "no ack for, s", "no tile for, s", "back after, s", title="faults"
-    )
+    table = Table("fault", "hit", "lasted, s", "acks", *_TIMES, title="faults")
     calm = () if outcome.calm is None else (outcome.calm,)
     for trial in (*calm, *outcome.trials):
         told = trial.as_dict()
-        times_s = (told["ack_gap_s"], told["tile_gap_s"], told["back_s"])
+        times_s = (told["ack_gap_s"], told["tile_gap_s"], told["version_gap_s"], told["back_s"])
         gaps = ["" if one is None else f"{one:.2f}" for one in times_s]
         table.add_row(trial.fault, trial.where, f"{told['lasted_s']:.0f}", str(told["acknowledged"]), *gaps)
     console.print(table)
+    if any(one.times > 1 for one in outcome.by_fault):
+        console.print(_spreads(outcome))
     found = outcome.findings
     left = Table(title="what is left", show_header=False)
     rows = {
@@ -37,6 +39,16 @@ def print_hosts(console: Console, outcome: "HostsOutcome") -> None:
     for name, value in rows.items():
         left.add_row(name, value)
     console.print(left)
+
+
+def _spreads(outcome: "HostsOutcome") -> Table:
+    table = Table("fault", "times", *_TIMES, title="mean and worst")
+    for one in outcome.by_fault:
+        pairs = (one.ack_gap_s, one.tile_gap_s, one.version_gap_s, one.back_s)
+        table.add_row(
+            one.fault, str(one.times), *("" if pair is None else f"{pair[0]:.2f}, {pair[1]:.2f}" for pair in pairs)
+        )
+    return table
 
 
 def hosts_verdict(outcome: "HostsOutcome") -> str:

@@ -1,6 +1,7 @@
 """What a run over hosts has found: per fault how long nobody was served, and whether anything is missing at the end."""
 
 import itertools
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -23,6 +24,7 @@ class HostTrial:
         region: that it was about; the last.
         acks_s: by region when reports were acknowledged.
         tiles_s: by region when tiles came.
+        versions_s: by region when new versions were heard of.
     """
 
     fault: str
@@ -34,6 +36,7 @@ class HostTrial:
     region: int
     acks_s: Sequence[Sequence[float]] = field(repr=False)
     tiles_s: Sequence[Sequence[float]] = field(repr=False)
+    versions_s: Sequence[Sequence[float]] = field(repr=False)
 
     @property
     def ack_gap_s(self) -> float:
@@ -44,6 +47,11 @@ class HostTrial:
     def tile_gap_s(self) -> float:
         """The same for tiles."""
         return self._gap_s(self.tiles_s)
+
+    @property
+    def version_gap_s(self) -> float:
+        """The same for notices of new versions: publishing. Without a fault there is a pause of some seconds, too."""
+        return self._gap_s(self.versions_s)
 
     @property
     def back_s(self) -> float | None:
@@ -71,6 +79,7 @@ class HostTrial:
             "acknowledged": self.acknowledged,
             "ack_gap_s": round(self.ack_gap_s, 2),
             "tile_gap_s": round(self.tile_gap_s, 2),
+            "version_gap_s": round(self.version_gap_s, 2),
             "back_s": None if self.back_s is None else round(self.back_s, 2),
         }
 
@@ -85,6 +94,51 @@ def longest_gap_s(times_s: Sequence[float], from_s: float, until_s: float) -> fl
     """
     inside = [from_s, *(t for t in times_s if from_s < t < until_s), until_s]
     return max(b - a for a, b in itertools.pairwise(inside))
+
+
+@dataclass(frozen=True, slots=True)
+class FaultSpread:
+    """What one fault cost in all its trials: each pair is the mean and the worst, s; None: it does not apply.
+
+    Attributes:
+        fault: its name.
+        times: how often it was inflicted.
+        ack_gap_s, tile_gap_s, version_gap_s, back_s: see `HostTrial`.
+    """
+
+    fault: str
+    times: int
+    ack_gap_s: tuple[float, float]
+    tile_gap_s: tuple[float, float]
+    version_gap_s: tuple[float, float]
+    back_s: tuple[float, float] | None
+
+    @classmethod
+    def of(cls, trials: Sequence[HostTrial]) -> "FaultSpread":
+        """Of the trials of one fault, at least one."""
+        back_s = [one.back_s for one in trials if one.back_s is not None]
+        return cls(
+            trials[0].fault,
+            len(trials),
+            _mean_and_worst([one.ack_gap_s for one in trials]),
+            _mean_and_worst([one.tile_gap_s for one in trials]),
+            _mean_and_worst([one.version_gap_s for one in trials]),
+            _mean_and_worst(back_s) if back_s else None,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        names = ("ack_gap_s", "tile_gap_s", "version_gap_s", "back_s")
+        pairs: dict[str, tuple[float, float] | None] = {name: getattr(self, name) for name in names}
+        told = {
+            name: None if pair is None else {"mean": round(pair[0], 2), "worst": round(pair[1], 2)}
+            for name, pair in pairs.items()
+        }
+        return {"fault": self.fault, "times": self.times, **told}
+
+
+def _mean_and_worst(values: Sequence[float]) -> tuple[float, float]:
+    return statistics.fmean(values), max(values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +182,12 @@ class HostsOutcome:
         unsettled = ["it did not settle"] if self.settled_s is None else []
         return self.findings.failures + late + unsettled + list(self.died)
 
+    @property
+    def by_fault(self) -> tuple[FaultSpread, ...]:
+        """Each fault over all its trials, in the order in which they came first."""
+        names = dict.fromkeys(one.fault for one in self.trials)
+        return tuple(FaultSpread.of([one for one in self.trials if one.fault == name]) for name in names)
+
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
         told = self.findings.as_dict()
@@ -142,6 +202,7 @@ class HostsOutcome:
             "interrupted": self.interrupted,
             "calm": None if self.calm is None else self.calm.as_dict(),
             "faults": [trial.as_dict() for trial in self.trials],
+            "by_fault": [spread.as_dict() for spread in self.by_fault],
             "restarts": self.restarts,
             "found": told["found"],
         }
