@@ -7,6 +7,7 @@ body meanwhile keeps it in the database. So neither needs to know of the other, 
 nothing but how young an object is left alone.
 """
 
+import logging
 import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
 from gnd.tile_store.connection import SqlConnection, change, fetch
-from gnd.tile_store.errors import BodiesAway, StoreDamaged, StoreError, StoreUnavailable
+from gnd.tile_store.errors import ObjectsAway, StoreDamaged, StoreError, StoreUnavailable
 from gnd.tile_store.memory import Memory
 from gnd.tile_store.objects import NamedObjects, ObjectSeen, check_creates, open_objects
 from gnd.tile_store.values import NS_PER_S, Content
@@ -29,6 +30,7 @@ COMMITTED_WITHIN_S: Final = GRACE_S / 4
 REMEMBERED_BYTES: Final = 64 * 1024 * 1024
 AT_ONCE: Final = 8
 TOGETHER: Final = 128
+_LOG: Final = logging.getLogger(__name__)
 _NAME: Final = re.compile(r"body/[0-9a-f]{2}/([0-9a-f]{64})\.(\d{1,4})")
 
 
@@ -42,17 +44,20 @@ class Bodies:
 
     Args:
         objects: where they lie.
+        is_checked: whether they are known to be created once (`check_creates`); if not, that is looked at before the
+            first one is put there.
     """
 
-    def __init__(self, objects: NamedObjects) -> None:
+    def __init__(self, objects: NamedObjects, *, is_checked: bool = True) -> None:
         self.objects = objects
+        self._is_checked = is_checked
         self._memory: Memory[bytes] = Memory(REMEMBERED_BYTES, len)
 
     def keep(self, contents: Sequence[Content]) -> list[Content]:
         """Put bodies there; the same contents, which say since when they are.
 
         Raises:
-            BodiesAway: the objects cannot be written.
+            ObjectsAway: the objects cannot be written.
         """
 
         def put(content: Content) -> Content:
@@ -61,6 +66,10 @@ class Bodies:
                 self.objects.put_new(body_name(content.sha, content.codec_id), content.body)
             return replace(content, kept_s=began_s)
 
+        if not self._is_checked:
+            with _away():
+                check_creates(self.objects)
+            self._is_checked = True
         if len(contents) < 2:
             return [put(one) for one in contents]
         with ThreadPoolExecutor(AT_ONCE) as threads:
@@ -71,7 +80,7 @@ class Bodies:
 
         Raises:
             StoreDamaged: there is none.
-            BodiesAway: the objects cannot be read.
+            ObjectsAway: the objects cannot be read.
         """
         name = body_name(sha, codec_id)
 
@@ -90,7 +99,7 @@ def _away() -> Iterator[None]:
     try:
         yield
     except StoreUnavailable as error:
-        raise BodiesAway(str(error)) from error
+        raise ObjectsAway(str(error)) from error
 
 
 def place_of_bodies(c: SqlConnection) -> str | None:
@@ -103,12 +112,27 @@ def bodies_at(location: str, *, to_write: bool) -> Bodies:
     """The bodies at a place.
 
     Raises:
+        ObjectsAway: `to_write`, and nobody answers there.
         StoreUnavailable: it cannot be used; or `to_write`, and it creates objects twice.
     """
     objects = open_objects(location)
     if to_write:
         check_creates(objects)
     return Bodies(objects)
+
+
+def bodies_at_start(location: str) -> Bodies:
+    """The bodies of a store that is opened. Where nobody answers there now, who only takes reports or serves what it
+    remembers can work all the same: then it is checked before the first body is put there.
+
+    Raises:
+        StoreUnavailable: it cannot be used, or creates objects twice.
+    """
+    try:
+        return bodies_at(location, to_write=True)
+    except ObjectsAway as error:
+        _LOG.warning("bodies of tiles cannot be read or written now: %s", error)
+        return Bodies(open_objects(location), is_checked=False)
 
 
 def lies_elsewhere(c: SqlConnection, content: Content) -> bool:

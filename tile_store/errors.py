@@ -5,7 +5,7 @@ StoreError             a store cannot do what was asked
 StoreUnavailable     it cannot be opened: no such file, no permission, not a store, a newer schema
 StoreDamaged       a part of it cannot be read
 StoreAway          the server of its database does not answer, or starts or stops
-BodiesAway         bodies of versions lie among objects, and who keeps those does not answer
+ObjectsAway        who keeps objects, such as bodies of versions, does not answer
 StoreBusy            another process has held the write lock for too long
 StoreMoved         it was copied to another database, which is used instead
 DistrictElsewhere    a district that the store does not own, or that is just moving: nothing was written
@@ -41,9 +41,9 @@ class StoreAway(StoreUnavailable):
     """The server of the store's database does not answer, or starts or stops: it may come."""
 
 
-class BodiesAway(StoreUnavailable):
-    """Bodies of versions lie among objects, and who keeps those does not answer, or refuses: it may pass. The database
-    is there, and nobody's report or tile is to blame.
+class ObjectsAway(StoreUnavailable):
+    """Who keeps objects, such as bodies of versions, does not answer, or cannot do now what is asked: it may pass. No
+    report and no tile is to blame.
     """
 
 

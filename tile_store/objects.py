@@ -83,8 +83,9 @@ def check_creates(objects: NamedObjects) -> None:
         StoreUnavailable: it does not.
     """
     name = f"probe/{secrets.token_hex(16)}"
+    is_new = objects.put_new(name, b"1")  # an error of it is told before anything is to be removed
     try:
-        if not objects.put_new(name, b"1") or objects.put_new(name, b"2"):
+        if not is_new or objects.put_new(name, b"2"):
             raise StoreUnavailable(
                 f"{objects.location}: creates an object that is there already (conditional writes, If-None-Match: *,"
                 " are not honoured); use a server that does"

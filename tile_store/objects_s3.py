@@ -8,10 +8,10 @@ from datetime import timedelta
 from typing import Final, Literal
 
 import obstore
-from obstore.exceptions import AlreadyExistsError, BaseError
+from obstore.exceptions import AlreadyExistsError, BaseError, GenericError
 from obstore.store import S3Store
 
-from gnd.tile_store.errors import StoreError, StoreUnavailable
+from gnd.tile_store.errors import ObjectsAway, StoreError, StoreUnavailable
 from gnd.tile_store.objects import ObjectSeen, check_name
 
 FOR_EVER: Final = "public, max-age=31536000, immutable"
@@ -22,6 +22,7 @@ _RETRY_FOR: Final = timedelta(seconds=20)
 _RETRIES: Final = 5
 _NS_PER_US: Final = 1_000
 _REMOVED_AT_ONCE: Final = 500
+_PASSING: Final = ("InternalError", "ServiceUnavailable", "SlowDown")
 _CODE: Final = re.compile(r"<Code>(\w+)</Code>")
 
 
@@ -115,4 +116,7 @@ class S3Objects:
             text = str(error)
             code = _CODE.search(text)
             said = code[1] if code else " ".join(text.split("\n\n")[0].split())[:160]
-            raise StoreUnavailable(f"{self._location}: cannot {what}: {type(error).__name__}: {said}") from None
+            # what has no code was answered by nobody
+            is_away = type(error) is GenericError and (code is None or code[1] in _PASSING)
+            kind = ObjectsAway if is_away else StoreUnavailable
+            raise kind(f"{self._location}: cannot {what}: {type(error).__name__}: {said}") from None

@@ -26,7 +26,7 @@ from gnd.tile_store import sql_trust as trust
 from gnd.tile_store import sql_uploads as uploads
 from gnd.tile_store import sql_versions as versions
 from gnd.tile_store.backup import copy_store
-from gnd.tile_store.bodies import Bodies, bodies_at, place_of_bodies
+from gnd.tile_store.bodies import Bodies, bodies_at, bodies_at_start, place_of_bodies
 from gnd.tile_store.connection import QueueClock, SqlConnection, Writer, change, fetch
 from gnd.tile_store.districts import DistrictOwners, DistrictState, owners_of_districts
 from gnd.tile_store.errors import StoreDamaged, StoreError, StoreMoved, UnknownVersion
@@ -177,7 +177,7 @@ class SqlStore(ABC):
                 self._writer.run(lambda c: inbox.enter_boot(c, self._clock.name, self._steady_ns()))
             place = self.look(place_of_bodies)
             if place is not None:
-                self._bodies = bodies_at(place, to_write=True)
+                self._bodies = bodies_at_start(place)
         except (StoreDamaged, StoreMoved) as error:  # what can be read shall be read
             _LOG.error("%s", error)
         except BaseException:
@@ -376,9 +376,7 @@ class SqlStore(ABC):
     def postpone(self, claim: Claim, delay_s: float, *, blameless: bool = False) -> None:
         """See `Store.postpone`."""
         self._writer.run(
-            lambda c: inbox.postpone(
-                c, claim, self._steady_ns() + round(delay_s * NS_PER_S), blameless=blameless
-            ),
+            lambda c: inbox.postpone(c, claim, self._steady_ns() + round(delay_s * NS_PER_S), blameless=blameless),
             inbox.locks_of([claim]),
         )
 

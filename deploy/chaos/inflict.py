@@ -8,21 +8,23 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final
+from pathlib import Path
+from typing import Final, Protocol
 
 import apsw
 import numpy as np
 
 from gnd.deploy.chaos import page
 from gnd.deploy.chaos.clients import put
-from gnd.deploy.chaos.cloud import ChaosCloud
 from gnd.deploy.chaos.faults import BY_NAME, Fault
 from gnd.deploy.chaos.street import LAYER, ChaosStreet, SentReport
+from gnd.deploy.processes import Supervisor
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import BusError
 from gnd.gnd_map.codec import encode_mask
 from gnd.gnd_map.errors import GndError
 from gnd.tile_store.errors import StoreError
+from gnd.tile_store.sqlite_store import SqlStore
 from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.link.sending import SenderThread
 from gnd.vehicle_agent.report.packing import askable, pack_measured
@@ -36,6 +38,59 @@ _LOG: Final = logging.getLogger(__name__)
 End = Callable[[], None]
 
 
+class HurtLines(Protocol):
+    """The lines of clients."""
+
+    def cut(self, name: str) -> None:
+        """End a client's connections, and let none be made."""
+
+    def hold(self, name: str) -> None:
+        """Carry nothing for a client."""
+
+    def mend(self, name: str) -> None:
+        """Carry all again."""
+
+
+class HurtCloud(Protocol):
+    """What is hurt: a cloud of one machine, or a laboratory of hosts."""
+
+    @property
+    def supervisor(self) -> Supervisor:
+        """Starts again what dies."""
+
+    @property
+    def wires(self) -> HurtLines:
+        """Lines of the clients."""
+
+    @property
+    def store(self) -> SqlStore:
+        """The store, opened here."""
+
+    @property
+    def path(self) -> Path:
+        """Its file, where it is one."""
+
+    @property
+    def folder(self) -> Path:
+        """In which the run writes."""
+
+    @property
+    def vehicles(self) -> Path:
+        """Folder of the outboxes."""
+
+    def names(self, part: str) -> list[str]:
+        """The processes of a part, in order; of "worker" the shards whose they are."""
+
+    def pids(self, part: str, name: str) -> list[int]:
+        """The process of a name, or the worker of a shard; empty while it is being started again."""
+
+    def step_clock(self, by_s: float) -> None:
+        """Set the time of day wrong by so much; 0 = right."""
+
+    def retry(self) -> None:
+        """Merge tiles again that were set aside."""
+
+
 class Inflictor:
     """Begins faults. `begin` tells what was hit and how it is ended; what has not been ended `end_all` ends.
 
@@ -46,7 +101,7 @@ class Inflictor:
         bus: for messages.
     """
 
-    def __init__(self, cloud: ChaosCloud, street: ChaosStreet, seed: int, bus: Bus) -> None:
+    def __init__(self, cloud: HurtCloud, street: ChaosStreet, seed: int, bus: Bus) -> None:
         self._cloud, self._street, self._seed, self._bus = cloud, street, seed, bus
         self._outbox = Outbox(cloud.vehicles / f"{MESSENGER}-000.sqlite")
         self._sender = SenderThread(bus, self._outbox, MESSENGER)
@@ -218,7 +273,7 @@ def _limit_files(pid: int, limit: int) -> None:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, hard))
 
 
-def _places_of_bodies(cloud: ChaosCloud, rng: random.Random, damaged: set[int]) -> dict[int, str]:
+def _places_of_bodies(cloud: HurtCloud, rng: random.Random, damaged: set[int]) -> dict[int, str]:
     """Offsets in bodies of newest versions that are in the file, not only in its log, and whole; and whose they are."""
     heads, found = cloud.store.heads(LAYER), dict[int, str]()
     for head in rng.sample(heads, len(heads)):

@@ -120,7 +120,7 @@ def run_chaos(
         stack.callback(inflictor.close)
         served = stack.enter_context(watched(cloud.connect, cloud.beacon, inflictor.probe()))
         _wait_for_merges(cloud, stop)
-        timeline = _Timeline(inflictor, on_step)
+        timeline = Timeline(inflictor, on_step)
         timeline.run(faults, stop, lambda: bool(cloud.died))
         stop.wait(CALM_S)  # what the last one cost is still to be seen
         end_s = time.monotonic()
@@ -156,7 +156,7 @@ def _wait_for_merges(cloud: ChaosCloud, stop: threading.Event) -> None:
             return
 
 
-class _Timeline:
+class Timeline:
     """Begins and ends faults in time; whatever happens, each one that was begun is ended."""
 
     def __init__(self, inflictor: Inflictor, on_step: OnStep) -> None:

@@ -1,19 +1,21 @@
 """Where bodies of versions lie among objects and those cannot be reached: nothing acknowledged is given up for it."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from merger_world import NEIGHBOUR, POLE, TILE, VOXEL_BY_VOXEL
+from s3_server import S3Server
 from short_world import KEY, drive_number, packed_of, tile_at
+from suite_ports import new_port
 from upload_desk import Desk
 
 from gnd.cloud_merger import expander, work
 from gnd.cloud_merger.config import MAX_ATTEMPTS, ShardConfig
 from gnd.cloud_merger.work import Worker
 from gnd.tile_store.bodies import move_out
-from gnd.tile_store.errors import BodiesAway
+from gnd.tile_store.errors import ObjectsAway, StoreUnavailable
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoreConfig
 
@@ -62,7 +64,7 @@ def store(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SqliteStore]:
 
 def test_an_acknowledged_upload_waits_for_as_long_as_bodies_are_away(store: SqliteStore, place: Place) -> None:
     place.go()
-    with pytest.raises(BodiesAway):
+    with pytest.raises(ObjectsAway):
         store.get("ndt", TILE)
     desk = Desk(store)
     assert desk.ack(KEY, PACKED).status == "stored"
@@ -100,3 +102,26 @@ def test_a_tile_waits_for_as_long_as_bodies_are_away_and_is_not_set_aside(
     (result,) = worker.settle_some([claim])
     assert result is not None
     assert result.status == "published"
+
+
+@pytest.mark.slow
+def test_a_store_is_opened_while_its_bucket_does_not_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, s3_server: S3Server, new_bucket: Callable[[], str]
+) -> None:
+    """Who takes reports needs no bodies; what is published waits for them, and is looked at first as at any start."""
+    path = tmp_path / "map.sqlite"
+    with SqliteStore(path) as store:
+        store.put_tiles([tile_at(TILE)])
+        move_out(store, new_bucket())
+    monkeypatch.setenv("AWS_ENDPOINT", f"http://127.0.0.1:{new_port()}")  # nobody listens there
+    with SqliteStore(path) as store:
+        assert Desk(store).ack(KEY, PACKED).status == "stored"
+        with pytest.raises(ObjectsAway, match="cannot read"):
+            store.get("ndt", TILE)
+        with pytest.raises(ObjectsAway, match="cannot write probe/"):
+            store.put_tiles([tile_at(NEIGHBOUR)])
+    monkeypatch.setenv("AWS_ENDPOINT", s3_server.environment["AWS_ENDPOINT"])
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
+    with pytest.raises(StoreUnavailable) as refused:  # an answer, not silence: told at once
+        SqliteStore(path)
+    assert not isinstance(refused.value, ObjectsAway)

@@ -1,24 +1,29 @@
 """The laboratory of hosts as a plan: where parts run, what is refused, who may take writes, how gaps are counted."""
 
+import io
 import json
 import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from lab_testing import finished, gnd_lab
+from rich.console import Console
 from suite_ports import new_port
 
 from gnd.deploy.chaos.checks import Findings
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.groups import DEFAULT_GROUPS
-from gnd.deploy.lab.hosts import data
+from gnd.deploy.lab.hosts import data, wrong_clock
 from gnd.deploy.lab.hosts.cloud import read_times
 from gnd.deploy.lab.hosts.faults import FAULTS, chosen_faults, parse_faults
 from gnd.deploy.lab.hosts.plan import DATABASES, OF_REGION, HostsSize, plan_hosts
 from gnd.deploy.lab.hosts.run import HostsOptions
+from gnd.deploy.lab.hosts.slow_disk import disk_of, groups_of_disks
+from gnd.deploy.lab.hosts.tables import print_hosts
 from gnd.deploy.lab.hosts.verdict import HostsOutcome, HostTrial, longest_gap_s
 from gnd.deploy.lab.hosts.witness import WitnessClient, WitnessState, witness
 
@@ -65,6 +70,9 @@ def test_a_store_is_looked_for_at_both_hosts_and_written_where_it_can_be() -> No
         (("hosts", "--hosts", "2", "--faults", "database-host"), "needs a third host, which decides"),
         (("hosts", "--regions", "1", "--faults", "partition"), "needs 2 regions"),
         (("hosts", "--cut", "nan"), "partition_s must be 0.05 to 3600, got nan"),
+        (("hosts", "--writes", "0"), "writes_per_s must be 1 to 10000, got 0"),
+        (("hosts", "--clock", "nan"), "clock_s must be 1 to 1e+08"),
+        (("hosts", "--faults", "silent-bucket-host"), "there is no bucket (--bucket)"),
         (("hosts", "--link", "6g"), "no link profile '6g'"),
         (("hosts", "--name", "../x"), "a lab's name is 1 to 20 of a-z"),
     ],
@@ -86,7 +94,66 @@ def test_the_folder_of_a_run_must_be_empty(tmp_path: Path) -> None:
 def test_faults_are_read_by_name() -> None:
     assert parse_faults("all") == FAULTS
     assert [fault.name for fault in parse_faults(" partition, router,")] == ["partition", "router"]
-    assert chosen_faults("all", plan_hosts("t", HostsSize(2, 4))) == FAULTS
+
+
+def test_all_faults_are_those_that_a_laboratory_and_its_machine_can_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wrong_clock, "PLACES", ("/nowhere",))
+    without = {fault.name for fault in chosen_faults("all", plan_hosts("t", HostsSize(2, 4)))}
+    of_buckets = {"bucket", "bucket-host", "silent-bucket-host"}
+    of_clocks = {fault.name for fault in FAULTS if fault.is_of_clocks}
+    assert without & (of_buckets | of_clocks) == set()
+    having = chosen_faults("all", plan_hosts("t", HostsSize(2, 4, has_bucket=True)))
+    assert {fault.name for fault in having} - without == of_buckets
+    for name, words in (("bucket", "there is no bucket"), ("drift", "wrong clocks need libfaketime")):
+        with pytest.raises(LabError, match=words):
+            chosen_faults(name, plan_hosts("t", HostsSize(2, 4)))
+
+
+def test_the_bucket_stands_away_from_the_database() -> None:
+    for hosts in range(3, 9):
+        plan = plan_hosts("t", HostsSize(2, hosts, has_bucket=True))
+        assert not set(DATABASES) & set(plan.host_of("bucket").parts)
+
+
+def test_of_repeated_faults_the_mean_and_the_worst_are_told() -> None:
+    quick, slow = [10.2, 11.0, 12.0, 13.0, 14.2], [10.2, 13.2, 14.2]
+    good = Findings(reports=3, acknowledged=3, versions=1, received=9, identical_map=True)
+    found = outcome((trial([quick]), trial([slow])), good)
+    (told,) = found.as_dict()["by_fault"]
+    assert told["ack_gap_s"] == {"mean": 2.1, "worst": 3.0}
+    assert (told["fault"], told["times"], told["back_s"]) == ("x", 2, None)
+    console = Console(width=150, record=True, file=io.StringIO())
+    print_hosts(console, found)
+    assert "2.10, 3.00" in console.export_text()
+    (told,) = outcome((trial([quick, quick], is_cut=True),), good).as_dict()["by_fault"]
+    assert told["back_s"] == {"mean": 0.5, "worst": 0.5}
+
+
+def groups_folder(root: Path, version: int) -> Path:
+    if version == 1:
+        (root / "blkio").mkdir(parents=True)
+        (root / "blkio" / "blkio.throttle.write_iops_device").touch()
+    else:
+        root.mkdir()
+        (root / "cgroup.controllers").write_text("cpu io memory\n")
+    return root
+
+
+def test_either_version_of_control_groups_can_slow_a_disk(tmp_path: Path) -> None:
+    one = groups_of_disks(groups_folder(tmp_path / "one", 1))
+    assert (one.bound, one.group_of("t")) == (
+        "blkio.throttle.write_iops_device",
+        tmp_path / "one" / "blkio" / "gndlab-t",
+    )
+    two = groups_of_disks(groups_folder(tmp_path / "two", 2))
+    assert (two.bound, two.before, two.root) == ("io.max", "wiops=", tmp_path / "two")
+    with pytest.raises(LabError, match="no control groups of disks under"):
+        groups_of_disks(tmp_path)
+
+
+def test_what_lies_on_no_disk_cannot_be_slowed() -> None:
+    with pytest.raises(LabError, match="/proc does not lie on a disk"):
+        disk_of(Path("/proc"))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +239,7 @@ def test_a_gap_is_the_longest_pause_and_lasts_up_to_the_end() -> None:
 
 def trial(acks_s: list[list[float]], *, is_cut: bool = False) -> HostTrial:
     tiles_s = [[10.5, 11.5, 12.5, 13.5, 14.5]] * len(acks_s)
-    return HostTrial("x", "host-1", 10.0, 14.0, 15.0, is_cut, len(acks_s) - 1, acks_s, tiles_s)
+    return HostTrial("x", "host-1", 10.0, 14.0, 15.0, is_cut, len(acks_s) - 1, acks_s, tiles_s, tiles_s)
 
 
 def test_the_worst_region_counts_and_a_cut_one_from_when_it_is_whole() -> None:
@@ -185,6 +252,15 @@ def test_the_worst_region_counts_and_a_cut_one_from_when_it_is_whole() -> None:
     assert trial([silent, served], is_cut=True).ack_gap_s == pytest.approx(4.8), "the cut one does not excuse it"
     assert trial([served, silent]).acknowledged == 6
     assert trial([served, silent]).as_dict()["tile_gap_s"] == 1.0
+
+
+def test_without_bodies_acknowledgements_count_and_how_soon_tiles_and_versions_come_again() -> None:
+    served, silent = [10.2, 11.0, 12.0, 13.0, 14.2], [9.0, 14.8]
+    gone = replace(trial([served, served]), is_bodiless=True, tiles_s=[silent, served], versions_s=[served, [14.9]])
+    assert (gone.counted_gap_s, gone.tile_gap_s) == (pytest.approx(1.2), pytest.approx(4.8))
+    assert gone.back_s == pytest.approx(0.9), "the last of all regions"
+    good = Findings(reports=3, acknowledged=3, versions=1, received=9, identical_map=True)
+    assert outcome((gone,), good).failures == []
 
 
 def outcome(trials: tuple[HostTrial, ...], findings: Findings, settled_s: float | None = 1.0) -> HostsOutcome:

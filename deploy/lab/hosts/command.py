@@ -42,6 +42,7 @@ SIZE: Final = HostsSize()
 @click.option("--cut", type=float, default=60.0, show_default=True, help="How long a region is cut off, s.")
 @click.option("--writes", type=int, default=5, show_default=True, help="A slow disk makes so many a second.")
 @click.option("--clock", type=float, default=600.0, show_default=True, help="A wrong clock is wrong by so much, s.")
+@click.option("--chaos", type=click.IntRange(1, 10_000), default=30, show_default=True, help="Faults of chaos in one.")
 @click.option("--every", type=float, default=0.5, show_default=True, help="A vehicle's reports are so far apart, s.")
 @click.option("--gap", type=float, default=5.0, show_default=True, help="Allowed time without service, s.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Draws the reports.")
@@ -66,7 +67,7 @@ def hosts(regions: int, count: int, vehicles: int, link: str, faults: str | None
     chosen = chosen_faults(faults, plan) * times
     run_options = HostsOptions(
         chosen, options["seed"], options["every"], options["away"], options["cut"], options["gap"], options["writes"],
-        options["clock"],
+        options["clock"], options["chaos"],
     )  # fmt: skip
     check_rights()
     folder = _folder(options["out"])

@@ -17,7 +17,7 @@ from gnd.deploy.lab.hosts.slow_disk import disk_of, groups_of_disks, slow_disk
 from gnd.deploy.lab.hosts.wrong_clock import library
 from gnd.deploy.lab.namespaces import pids_in
 
-Way = Literal["process", "host", "silent", "partition", "one-way", "disk", "clock", "drift"]
+Way = Literal["process", "host", "silent", "partition", "one-way", "disk", "clock", "drift", "chaos"]
 GONE_WITHIN_S: Final = 30.0
 _LOOK_S: Final = 0.01
 
@@ -32,7 +32,7 @@ class HostFault:
         name: as the command and the report name it.
         way: a process is killed; all processes of a host; or the host falls silent, as one without power. Or a region
             is cut off from all others, or what it sends is lost and what it is sent arrives. A host's disk is slow,
-            its clock is wrong, or the clocks of a region's hosts are fast.
+            its clock is wrong, or the clocks of a region's hosts are fast. Or faults of `gnd chaos`, drawn from a seed.
         part: whose process or host it is; "primary", "standby": whoever is it then. Of the last
             region, where it has one; "" none.
     """
@@ -45,6 +45,11 @@ class HostFault:
     def is_cut(self) -> bool:
         """Whether a region cannot be served while it lasts."""
         return self.way in ("partition", "one-way")
+
+    @property
+    def is_bodiless(self) -> bool:
+        """Whether bodies can be neither read nor written while it lasts."""
+        return self.part == BUCKET
 
     @property
     def is_long(self) -> bool:
@@ -94,6 +99,7 @@ FAULTS: Final = (
     HostFault("clock-shard-host", "clock", "shard"),
     HostFault("clock-database-host", "clock", "primary"),
     HostFault("drift", "drift"),
+    HostFault("chaos", "chaos"),
 )
 BY_FAULT: Final = {fault.name: fault for fault in FAULTS}
 DEFAULT_FAULTS: Final = "router-host,tiles-host,shard-host,database-host,partition"
@@ -136,7 +142,7 @@ def why_not_survived(fault: HostFault, plan: HostsPlan) -> str:
     if lacks := _lacks(fault, plan):
         return lacks
     is_database = fault.part in ("primary", "standby")
-    if fault.way in ("disk", "clock", "drift"):
+    if fault.way in ("disk", "clock", "drift", "chaos"):
         return ""
     if is_database and not plan.has_witness:
         return "the loss of a database host needs a third host, which decides who goes on"

@@ -3,16 +3,17 @@
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from gnd.deploy.chaos.checks import Findings, compare_reports, find_stuck, read_outbox, verified
 from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
-from gnd.deploy.chaos.run import HURRIED_S
+from gnd.deploy.chaos.run import HURRIED_S, RETRY_S
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.errors import LabError
+from gnd.deploy.lab.hosts.chaos import LabChaos, lab_chaos
 from gnd.deploy.lab.hosts.cloud import HEARD_SUFFIX, LabFolders, client_names, read_times
 from gnd.deploy.lab.hosts.faults import HostFault, HowMuch, begin_fault, is_back
 from gnd.deploy.lab.hosts.plan import HostsPlan
@@ -51,6 +52,7 @@ class HostsOptions:
         longest_gap_s: allowed without service, s.
         writes_per_s: that a slow disk makes.
         clock_s: by which a wrong clock is wrong, s.
+        chaos: so many faults of chaos in one.
     """
 
     faults: tuple[HostFault, ...]
@@ -61,6 +63,7 @@ class HostsOptions:
     longest_gap_s: float = LONGEST_GAP_S
     writes_per_s: int = 5
     clock_s: float = 600.0
+    chaos: int = 30
 
     def __post_init__(self) -> None:
         for name in ("every_s", "away_s", "partition_s", "longest_gap_s"):
@@ -69,7 +72,7 @@ class HostsOptions:
         if not 1 <= self.writes_per_s <= MOST_WRITES:
             raise LabError(f"writes_per_s must be 1 to {MOST_WRITES}, got {self.writes_per_s}")
         if not 1.0 <= abs(self.clock_s) <= MOST_CLOCK_S:
-            raise LabError(f"clock_s must be 1 to {MOST_CLOCK_S:g} or minus that, got {self.clock_s}")
+            raise LabError(f"clock_s must be 1 to {MOST_CLOCK_S:g}, or that below 0, got {self.clock_s}")
 
     @property
     def how_much(self) -> HowMuch:
@@ -113,13 +116,17 @@ def run_hosts(
             has_clocks=any(fault.is_of_clocks for fault in options.faults),
         ) as cloud,
     ):
-        course = _Course(cloud, options, stop, on_step)
-        course.wait_for_work()
-        calm = course.calm()
-        trials = course.trials()
-        on_step("settling", len(trials))
-        with open_store(plan.database_url, create=False) as store:
-            settled_s = _settle(cloud, store, HURRIED_S if stop.is_set() else SETTLE_S)
+        with ExitStack() as stack:
+            store = stack.enter_context(open_store(plan.database_url, create=False))
+            chaos = None
+            if any(fault.way == "chaos" for fault in options.faults):
+                chaos = stack.enter_context(lab_chaos(cloud, street, options.seed, store))
+            course = _Course(cloud, options, stop, on_step, chaos)
+            course.wait_for_work()
+            calm = course.calm()
+            trials = course.trials()
+            on_step("settling", len(trials))
+            settled_s = _settle(cloud, store, HURRIED_S if stop.is_set() else SETTLE_S, chaos)
             on_step("checking", len(trials))
             findings = _look(cloud, store)
         restarts, died = dict(cloud.supervisor.restarts), tuple(cloud.died)
@@ -136,14 +143,23 @@ def run_hosts(
         interrupted=stop.is_set(),
         restarts=restarts,
         died=died,
+        chaos=tuple(chaos.rows) if chaos else (),
     )
 
 
 class _Course:
     """What happens while the clients work."""
 
-    def __init__(self, cloud: HostsCloud, options: HostsOptions, stop: threading.Event, on_step: OnHostsStep) -> None:
+    def __init__(
+        self,
+        cloud: HostsCloud,
+        options: HostsOptions,
+        stop: threading.Event,
+        on_step: OnHostsStep,
+        chaos: LabChaos | None,
+    ) -> None:
         self._cloud, self._options, self._stop, self._on_step = cloud, options, stop, on_step
+        self._chaos = chaos
 
     def wait_for_work(self) -> None:
         """Until all regions are served and something is merged: before that nothing can be lost.
@@ -180,15 +196,22 @@ class _Course:
 
     def _inflict(self, fault: HostFault) -> HostTrial:
         began_s = time.monotonic()
+        if fault.way == "chaos" and self._chaos is not None:
+            where = self._chaos.inflict(self._options.chaos, self._stop)
+            return self._ended(fault, where, (began_s, time.monotonic()))
         where, end = begin_fault(self._cloud, fault, self._options.how_much)
         try:
             self._stop.wait(self._options.partition_s if fault.is_long else self._options.away_s)
         finally:
             ended_s = time.monotonic()
             end()
+        return self._ended(fault, where, (began_s, ended_s))
+
+    def _ended(self, fault: HostFault, where: str, span_s: tuple[float, float]) -> HostTrial:
         self._wait_until_back()
         self._stop.wait(CALM_S)
-        return self._trial(fault.name, where, (began_s, ended_s), is_cut=fault.is_cut)
+        trial = self._trial(fault.name, where, span_s, is_cut=fault.is_cut)
+        return replace(trial, is_bodiless=fault.is_bodiless)
 
     def _wait_until_back(self) -> None:
         deadline_s = time.monotonic() + BACK_S
@@ -222,15 +245,20 @@ def _vehicles(plan: HostsPlan) -> Sequence[str]:
     return [name for region in range(plan.size.regions) for name in client_names(plan, region)[:-1]]
 
 
-def _settle(cloud: HostsCloud, store: SqlStore, within_s: float) -> float | None:
-    """Let the vehicles finish and the cloud work off what it has; how long it took, None: it came to no end."""
-    begin_s = time.monotonic()
+def _settle(cloud: HostsCloud, store: SqlStore, within_s: float, chaos: LabChaos | None) -> float | None:
+    """Let the vehicles finish and the cloud work off what it has; how long it took, None: it came to no end. What
+    chaos has brought to be set aside is merged again.
+    """
+    begin_s = retried_s = time.monotonic()
     (cloud.folders.vehicles / ENOUGH).touch()
     while time.monotonic() < begin_s + within_s and not cloud.died:
         time.sleep(_LOOK_S)
         with suppress(StoreError):
-            if not _still_open(cloud) and _has_no_work(store):
+            if not _still_open(cloud) + (chaos.still_open() if chaos else 0) and _has_no_work(store):
                 return time.monotonic() - begin_s
+            if chaos and time.monotonic() - retried_s > RETRY_S:
+                retried_s = time.monotonic()
+                chaos.victim.retry()
     return None
 
 

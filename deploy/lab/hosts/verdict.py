@@ -25,6 +25,8 @@ class HostTrial:
         acks_s: by region when reports were acknowledged.
         tiles_s: by region when tiles came.
         versions_s: by region when new versions were heard of.
+        is_bodiless: whether bodies could not be read or written while it lasted: only tiles that somebody remembered
+            could be had, and nothing was published.
     """
 
     fault: str
@@ -37,6 +39,7 @@ class HostTrial:
     acks_s: Sequence[Sequence[float]] = field(repr=False)
     tiles_s: Sequence[Sequence[float]] = field(repr=False)
     versions_s: Sequence[Sequence[float]] = field(repr=False)
+    is_bodiless: bool = False
 
     @property
     def ack_gap_s(self) -> float:
@@ -55,11 +58,20 @@ class HostTrial:
 
     @property
     def back_s(self) -> float | None:
-        """How long after its end a cut region had an acknowledgement and a tile again; None: none was cut."""
-        if not self.is_cut:
+        """How long after its end a cut region had an acknowledgement and a tile again, or every region a tile and a new
+        version; None: nothing was kept from any.
+        """
+        if not self.is_cut and not self.is_bodiless:
             return None
-        served = self.acks_s[self.region], self.tiles_s[self.region]
+        served = [self.acks_s[self.region], self.tiles_s[self.region]]
+        if self.is_bodiless:
+            served = [*self.tiles_s, *self.versions_s]
         return max(next((t for t in times_s if t > self.ended_s), self.until_s) for times_s in served) - self.ended_s
+
+    @property
+    def counted_gap_s(self) -> float:
+        """The time without a service that must not end."""
+        return self.ack_gap_s if self.is_bodiless else max(self.ack_gap_s, self.tile_gap_s)
 
     @property
     def acknowledged(self) -> int:
@@ -157,6 +169,7 @@ class HostsOutcome:
         interrupted: by Ctrl-C.
         restarts: how often each process was started again by the supervisor.
         died: parts that would not live.
+        chaos: the faults of chaos, as `gnd chaos` tells them.
     """
 
     plan: dict[str, list[str]]
@@ -170,14 +183,15 @@ class HostsOutcome:
     interrupted: bool
     restarts: dict[str, int]
     died: tuple[str, ...]
+    chaos: tuple[dict[str, Any], ...] = ()
 
     @property
     def failures(self) -> list[str]:
         """What must not be, in words; empty: all guarantees were kept."""
         late = [
-            f"{one.fault} ({one.where}): {max(one.ack_gap_s, one.tile_gap_s):.1f} s without service"
+            f"{one.fault} ({one.where}): {one.counted_gap_s:.1f} s without service"
             for one in self.trials
-            if max(one.ack_gap_s, one.tile_gap_s) > self.longest_gap_s
+            if one.counted_gap_s > self.longest_gap_s
         ]
         unsettled = ["it did not settle"] if self.settled_s is None else []
         return self.findings.failures + late + unsettled + list(self.died)
@@ -203,6 +217,7 @@ class HostsOutcome:
             "calm": None if self.calm is None else self.calm.as_dict(),
             "faults": [trial.as_dict() for trial in self.trials],
             "by_fault": [spread.as_dict() for spread in self.by_fault],
+            "chaos": list(self.chaos),
             "restarts": self.restarts,
             "found": told["found"],
         }
