@@ -2,8 +2,13 @@
 
 import io
 import json
+import os
+import shutil
 import socket
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -17,7 +22,7 @@ from suite_ports import new_port
 from gnd.deploy.chaos.checks import Findings
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.groups import DEFAULT_GROUPS
-from gnd.deploy.lab.hosts import data, wrong_clock
+from gnd.deploy.lab.hosts import data
 from gnd.deploy.lab.hosts.cloud import read_times
 from gnd.deploy.lab.hosts.faults import FAULTS, chosen_faults, parse_faults
 from gnd.deploy.lab.hosts.plan import DATABASES, OF_REGION, HostsSize, plan_hosts
@@ -26,6 +31,7 @@ from gnd.deploy.lab.hosts.slow_disk import disk_of, groups_of_disks
 from gnd.deploy.lab.hosts.tables import print_hosts
 from gnd.deploy.lab.hosts.verdict import HostsOutcome, HostTrial, longest_gap_s
 from gnd.deploy.lab.hosts.witness import WitnessClient, WitnessState, witness
+from gnd.deploy.lab.hosts.wrong_clock import HostClocks, clocks_may_be_wrong
 
 
 @pytest.mark.parametrize("size", [(r, h) for h in range(2, 9) for r in range(1, h + 1)])
@@ -97,14 +103,14 @@ def test_faults_are_read_by_name() -> None:
 
 
 def test_all_faults_are_those_that_a_laboratory_and_its_machine_can_have(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wrong_clock, "PLACES", ("/nowhere",))
+    monkeypatch.setenv("PATH", "/nowhere")
     without = {fault.name for fault in chosen_faults("all", plan_hosts("t", HostsSize(2, 4)))}
     of_buckets = {"bucket", "bucket-host", "silent-bucket-host"}
     of_clocks = {fault.name for fault in FAULTS if fault.is_of_clocks}
     assert without & (of_buckets | of_clocks) == set()
     having = chosen_faults("all", plan_hosts("t", HostsSize(2, 4, has_bucket=True)))
     assert {fault.name for fault in having} - without == of_buckets
-    for name, words in (("bucket", "there is no bucket"), ("drift", "wrong clocks need libfaketime")):
+    for name, words in (("bucket", "there is no bucket"), ("drift", "wrong clocks need a C compiler")):
         with pytest.raises(LabError, match=words):
             chosen_faults(name, plan_hosts("t", HostsSize(2, 4)))
 
@@ -149,6 +155,27 @@ def test_either_version_of_control_groups_can_slow_a_disk(tmp_path: Path) -> Non
     assert (two.bound, two.before, two.root) == ("io.max", "wiops=", tmp_path / "two")
     with pytest.raises(LabError, match="no control groups of disks under"):
         groups_of_disks(tmp_path)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_a_clock_is_wrong_in_the_processes_of_its_host_alone_and_nothing_else_is(tmp_path: Path) -> None:
+    """Real processes: one that is told of its clock after it was forked, and one that it starts."""
+    one, other = plan_hosts("t", HostsSize(2, 2)).hosts
+    clocks = HostClocks(tmp_path / "clocks")
+    environments = [dict(clocks.environment(host)) for host in (one, other)]
+    ask = "import time; time.sleep(0.01); print(time.time(), time.monotonic())"
+    fork = f"import os\nos.environ.update({environments[0]!r})\n{ask}"
+    clocks.put(one, -600.0)
+    with clocks_may_be_wrong(tmp_path):
+        told = [subprocess.run([sys.executable, "-c", ask], env=os.environ | env, capture_output=True, check=True)
+                for env in (environments[0], environments[1], {})]  # fmt: skip
+        told.append(subprocess.run([sys.executable, "-c", fork], capture_output=True, check=True))
+    day_s, steady_s = zip(*(map(float, one.stdout.split()) for one in told), strict=True)
+    assert [round((time.time() - one) / 600) for one in day_s] == [1, 0, 0, 1]
+    assert max(steady_s) - min(steady_s) < 60
+    end = clocks.drift(one)
+    end()
+    assert (tmp_path / "clocks" / "host-0.clock").read_bytes() == bytes(8), "right again"
 
 
 def test_what_lies_on_no_disk_cannot_be_slowed() -> None:

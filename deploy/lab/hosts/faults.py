@@ -14,7 +14,7 @@ from gnd.deploy.lab.hosts.network import LabEnd, lose_between
 from gnd.deploy.lab.hosts.plan import BUCKET, DATABASES, HostsPlan, LabHost
 from gnd.deploy.lab.hosts.running import HostsCloud
 from gnd.deploy.lab.hosts.slow_disk import disk_of, groups_of_disks, slow_disk
-from gnd.deploy.lab.hosts.wrong_clock import library
+from gnd.deploy.lab.hosts.wrong_clock import compiler
 from gnd.deploy.lab.namespaces import pids_in
 
 Way = Literal["process", "host", "silent", "partition", "one-way", "disk", "clock", "drift", "chaos"]
@@ -159,7 +159,7 @@ def _lacks(fault: HostFault, plan: HostsPlan) -> str:
         return "there is no bucket (--bucket)"
     try:
         if fault.is_of_clocks:
-            library()
+            compiler()
         elif fault.way == "disk":
             groups_of_disks()
     except LabError as error:
