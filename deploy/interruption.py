@@ -9,15 +9,31 @@ from types import FrameType
 from gnd.ending import orderly
 
 
+class Ending(threading.Event):
+    """Is set by Ctrl-C or SIGTERM.
+
+    Attributes:
+        is_awaited: whether somebody looks at it; else the first signal, too, raises KeyboardInterrupt.
+    """
+
+    is_awaited = True
+
+
 @contextmanager
-def ending_in_order() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C or SIGTERM sets; the second one raises KeyboardInterrupt."""
-    stop = threading.Event()
+def ending_in_order(*, is_awaited: bool = True) -> Iterator[Ending]:
+    """Give an event that Ctrl-C or SIGTERM sets; the second one raises KeyboardInterrupt.
+
+    Args:
+        is_awaited: whether the event is looked at from the first; who looks at it only later says so by its attribute.
+    """
+    stop = Ending()
+    stop.is_awaited = is_awaited
 
     def end(_number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
+        was_set = stop.is_set()
         stop.set()
+        if was_set or not stop.is_awaited:
+            raise KeyboardInterrupt
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

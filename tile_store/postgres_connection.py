@@ -42,6 +42,8 @@ MOVED_STATE: Final = "GND01"
 """The code of PostgreSQL's error for a store that has moved."""
 ELSEWHERE_STATE: Final = "GND02"
 """The same for a district of another store."""
+STEP_NS: Final = 2_000_000_000
+"""A clock that goes back by more was set; less is how exactly it is read on a busy machine."""
 CLOCK_NAME: Final = "database"
 _SETTINGS: Final = (
     "SET client_min_messages = warning; SET jit = off; SET lock_timeout = '30s'; SET DateStyle = ISO; "
@@ -76,14 +78,17 @@ SQL: Final = MappingProxyType({name: BoundStatement.of(sql) for name, sql in sta
 class DatabaseClock:
     """The database's clock, read now and then, between that the machine's own: one for shards of all hosts.
 
-    A date that is set on the database's host moves the ends of leases by as much. A lease that ends early costs work
-    twice, never a report: what counts is its token, and the head that is compared (decision 0011).
+    A date that is set on the database's host, or a standby that takes over with another, moves the ends of leases by as
+    much. A lease that ends early costs work twice, never a report: what counts is its token, and the head that is
+    compared (decision 0011). One that would end late would hold up work for as long, so who sees the clock go back
+    frees all (`stepped_back`).
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._ahead_ns = 0
         self._read_s = float("-inf")
+        self._stepped_back = False
 
     @property
     def name(self) -> str:
@@ -102,8 +107,15 @@ class DatabaseClock:
             before = time.monotonic_ns()
             row = raw.execute(SQL["now"].sql, binary=True).fetchone()
             assert row is not None
-            self._ahead_ns = int(row[0]) - (before + time.monotonic_ns()) // 2
-            self._read_s = time.monotonic()
+            ahead_ns = int(row[0]) - (before + time.monotonic_ns()) // 2
+            self._stepped_back |= self._ahead_ns - ahead_ns > STEP_NS and self._read_s > 0.0
+            self._ahead_ns, self._read_s = ahead_ns, time.monotonic()
+
+    def stepped_back(self) -> bool:
+        """Whether it has gone back since this was asked last."""
+        with self._lock:
+            told, self._stepped_back = self._stepped_back, False
+            return told
 
 
 class _Question:

@@ -1,6 +1,7 @@
 """The store in a PostgreSQL database that the processes of many machines may open."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -8,6 +9,7 @@ from typing import Final
 import psycopg
 
 from gnd.tile_store import clocks
+from gnd.tile_store import sql_inbox as inbox
 from gnd.tile_store.errors import StoreError, StoreUnavailable
 from gnd.tile_store.migrations import SCHEMA_VERSION, STEPS
 from gnd.tile_store.postgres_connection import (
@@ -24,8 +26,10 @@ from gnd.tile_store.postgres_writer import LOCKS, PostgresWriter
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sql import statements
 from gnd.tile_store.sqlite_store import GROUP_MAX, SqlStore
-from gnd.tile_store.values import StoreConfig
+from gnd.tile_store.values import Claim, StoreConfig
 from gnd.tile_store.writer import NoWriter
+
+_LOG: Final = logging.getLogger(__name__)
 
 PROGRAM: Final = "gnd"
 FIRST_SCHEMA: Final = 12
@@ -78,10 +82,18 @@ class PostgresStore(SqlStore):
 
         _bring_up_to_date(open_one, location, create=create, read_only=read_only)
         writer = NoWriter(location) if read_only else PostgresWriter(location, open_one, group_max=GROUP_MAX)
+        self._database_clock = clock
         queue = clock if steady_ns is None else _ToldClock(clock.name, steady_ns)
         super().__init__(location, PostgresReaders(conninfo, clock), writer, config, signing, now_ns, queue, clock)
         if not read_only:
             self._enter_boot()
+
+    def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
+        """See `Store.claim`. Where the database's clock has gone back, all that waits by it is free first."""
+        if self._database_clock.stepped_back():
+            _LOG.warning("%s: the clock of the database has gone back: what waits by it is free", self.location)
+            self._writer.run(lambda c: inbox.forget_times(c, self._steady_ns()))
+        return super().claim(owner, n, lease_s, prefer)
 
     def backup(self, path: str | Path) -> None:
         """A database is backed up with its own tools.

@@ -227,6 +227,12 @@ def enter_boot(c: SqlConnection, boot: str, steady: int) -> None:
         post(c, "put_boot", {"boot": boot})
 
 
+def forget_times(c: SqlConnection, steady: int) -> None:
+    """Free all leases of tiles and of uploads, and make all tiles ready: the clock by which they wait was set back."""
+    post(c, "forget_leases", {"steady": steady})
+    post(c, "forget_upload_leases", {})
+
+
 def release(c: SqlConnection, owner: str) -> int:
     """Free an owner's leases; how many they were."""
     return change(c, "release_owner", {"owner": owner})

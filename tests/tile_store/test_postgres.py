@@ -14,14 +14,17 @@ import pytest
 from postgres_server import PostgresServer
 from store_helpers import EAGER, TILE, Clock, PostgresMaker, report, tile_of_voxels
 
+from gnd.tile_store import postgres_connection
 from gnd.tile_store.errors import StoreUnavailable
 from gnd.tile_store.location import file_of, open_store, shown
 from gnd.tile_store.migrations import SCHEMA_VERSION
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.uploads import Settled, Upload
+from gnd.tile_store.values import NS_PER_S
 
 psycopg = pytest.importorskip("psycopg", reason="pip install 'gnd-fleet[postgres]'")
 from gnd.tile_store.postgres_connection import SQL, DatabaseClock, _require_new_enough, connect  # noqa: E402
+from gnd.tile_store.postgres_connection import SQL, DatabaseClock, _require_new_enough  # noqa: E402
 from gnd.tile_store.postgres_connection import shown as shown_conninfo  # noqa: E402
 from gnd.tile_store.postgres_store import PostgresStore  # noqa: E402
 from gnd.tile_store.postgres_wire import PostgresWire  # noqa: E402
@@ -160,6 +163,33 @@ def test_leases_run_by_the_clock_of_the_database(new_database: NewDatabase) -> N
                 "SELECT abs(extract(epoch FROM clock_timestamp())::float8 - beat_ns / 1e9::float8) FROM shard"
             ).fetchall()
         assert ahead_s < 60.0, "not a monotonic clock of this machine"
+
+
+@pytest.mark.parametrize("back_s", [600, 1])
+def test_what_waits_by_a_clock_that_goes_back_is_free(
+    new_database: NewDatabase, monkeypatch: pytest.MonkeyPatch, back_s: int
+) -> None:
+    """The host of the database was fast, and is set right; its dead shards would hold what they had for as long."""
+    monkeypatch.setattr(postgres_connection, "CLOCK_READ_EVERY_S", 0.0)
+    fast = DatabaseClock.read_with
+
+    def read_fast(clock: DatabaseClock, raw: Any) -> None:
+        fast(clock, raw)
+        clock._ahead_ns += back_s * NS_PER_S
+
+    url, upload = new_database(), Upload("k", b"flags", report(1).report_id, "v1", "packed", 1)
+    store = PostgresStore(url, EAGER)
+    with monkeypatch.context() as wrong:
+        wrong.setattr(DatabaseClock, "read_with", read_fast)
+        store.put_reports([report(2)])
+        assert len(store.claim("dead", 1, 5.0)) == 1
+        store.put_upload(upload, "dead")
+        assert len(store.claim_uploads("dead", 1, 5.0)) == 1
+    store.dirty_count()  # the clock is read
+    held = store.claim("lives", 1, 5.0), store.claim_uploads("lives", 1, 5.0)
+    assert [len(one) for one in held] == ([1, 1] if back_s > 2 else [0, 0])
+    assert store.claim("other", 1, 5.0) == [], "once, not whenever it is looked"
+    store.close()
 
 
 def test_a_lost_connection_is_made_again(new_database: NewDatabase) -> None:

@@ -1030,6 +1030,9 @@ INSERT INTO queue_boot (one, boot) VALUES (1, :boot) ON CONFLICT (one) DO UPDATE
 -- name: forget_leases
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :steady
 
+-- name: forget_upload_leases
+UPDATE upload SET owner = NULL, token = NULL, lease_ns = 0 WHERE state = 'waiting' AND lease_ns > 0
+
 -- name: set_aside
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :again_ns,
   aside_ns = COALESCE(aside_ns, :now), aside_reason = :reason

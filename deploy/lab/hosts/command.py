@@ -103,7 +103,7 @@ def _run(plan: HostsPlan, profile: LinkProfile, options: "HostsOptions", folder:
     server_user()
     name = plan.hosts[0].lab
     with (
-        ending_in_order() as stop,
+        ending_in_order(is_awaited=False) as stop,
         _surroundings(plan, options, folder),
         progress_bars(Console(stderr=True)) as progress,
     ):

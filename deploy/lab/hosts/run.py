@@ -1,6 +1,5 @@
 """One run over hosts: start, be calm, hurt and wait for each fault, let it settle, look."""
 
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -13,6 +12,7 @@ from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
 from gnd.deploy.chaos.run import HURRIED_S, RETRY_S
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.errors import LabError
+from gnd.deploy.interruption import Ending
 from gnd.deploy.lab.hosts.chaos import LabChaos, lab_chaos
 from gnd.deploy.lab.hosts.cloud import HEARD_SUFFIX, LabFolders, client_names, read_times
 from gnd.deploy.lab.hosts.faults import HostFault, HowMuch, begin_fault, is_back
@@ -85,7 +85,7 @@ def run_hosts(
     lab: Lab,
     folders: LabFolders,
     options: HostsOptions,
-    stop: threading.Event,
+    stop: Ending,
     on_step: OnHostsStep = lambda _what, _n: None,
 ) -> HostsOutcome:
     """Run the laboratory, inflict the faults, let it settle and look at what is left.
@@ -97,7 +97,8 @@ def run_hosts(
         lab: namespaces and links.
         folders: made.
         options: of the run.
-        stop: ends the faults early; what was found until then is the outcome.
+        stop: ends the faults early; what was found until then is the outcome. It is awaited from when the laboratory
+            works.
         on_step: progress.
 
     Raises:
@@ -123,6 +124,7 @@ def run_hosts(
                 chaos = stack.enter_context(lab_chaos(cloud, street, options.seed, store))
             course = _Course(cloud, options, stop, on_step, chaos)
             course.wait_for_work()
+            stop.is_awaited = True
             calm = course.calm()
             trials = course.trials()
             on_step("settling", len(trials))
@@ -154,7 +156,7 @@ class _Course:
         self,
         cloud: HostsCloud,
         options: HostsOptions,
-        stop: threading.Event,
+        stop: Ending,
         on_step: OnHostsStep,
         chaos: LabChaos | None,
     ) -> None:
