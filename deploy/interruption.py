@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from gnd.ending import orderly
+from gnd.ending import ORDERLY_S, orderly
 
 
 class Ending(threading.Event):
@@ -20,11 +20,12 @@ class Ending(threading.Event):
 
 
 @contextmanager
-def ending_in_order(*, is_awaited: bool = True) -> Iterator[Ending]:
+def ending_in_order(*, is_awaited: bool = True, within_s: float = ORDERLY_S) -> Iterator[Ending]:
     """Give an event that Ctrl-C or SIGTERM sets; the second one raises KeyboardInterrupt.
 
     Args:
         is_awaited: whether the event is looked at from the first; who looks at it only later says so by its attribute.
+        within_s: so long after the first signal the program is killed.
     """
     stop = Ending()
     stop.is_awaited = is_awaited
@@ -37,7 +38,7 @@ def ending_in_order(*, is_awaited: bool = True) -> Iterator[Ending]:
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with orderly():
+        with orderly(within_s):
             yield stop
     finally:
         for number, handler in before.items():

@@ -18,6 +18,7 @@ NAMES: Final = (
     "stalled",
     "outage",
     "router-loss",
+    "district-move",
     "shares",
     "flooder",
     "herd",

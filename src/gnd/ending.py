@@ -72,9 +72,13 @@ def exit_code() -> int:
 
 
 @contextmanager
-def orderly() -> Iterator[None]:
-    """The command has something to put in order: on the first signal it gets more time, the second ends it at once."""
-    before, _grace_s[0] = _grace_s[0], ORDERLY_S
+def orderly(within_s: float = ORDERLY_S) -> Iterator[None]:
+    """The command has something to put in order: on the first signal it gets more time, the second ends it at once.
+
+    Args:
+        within_s: so long after the first signal it is killed.
+    """
+    before, _grace_s[0] = _grace_s[0], within_s
     try:
         yield
     finally:
@@ -86,7 +90,7 @@ def ending_at_once() -> Iterator[None]:
     """A signal within the block ends the process without more ado: while modules are imported. Not where there is
     something to put in order.
     """
-    before, _at_once[0] = _at_once[0], _grace_s[0] != ORDERLY_S
+    before, _at_once[0] = _at_once[0], _grace_s[0] == GRACE_S
     try:
         yield
     finally:

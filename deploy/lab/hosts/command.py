@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 ACCOUNT: Final = "lab_hosts.json"
 WIDTH: Final = 150
+WITHIN_S: Final = 120.0
+"""An interrupted run settles, is looked at, and ends some twenty processes on all hosts: on a busy machine it takes
+more than others get."""
 SIZE: Final = HostsSize()
 
 
@@ -103,7 +106,7 @@ def _run(plan: HostsPlan, profile: LinkProfile, options: "HostsOptions", folder:
     server_user()
     name = plan.hosts[0].lab
     with (
-        ending_in_order(is_awaited=False) as stop,
+        ending_in_order(is_awaited=False, within_s=WITHIN_S) as stop,
         _surroundings(plan, options, folder),
         progress_bars(Console(stderr=True)) as progress,
     ):
