@@ -172,6 +172,8 @@ def run(chosen: DistrictMoveOptions | None = None) -> list[Figure]:
         "longest_tile_s": ("longest time to a tile while it moves", "s"),
         "seconds": ("the whole command", "s"),
     }
+    reports = sum(one.reports for one in moved)
+    about = f"{about}, {reports} reports"
     return [_figure(f"{about}: {text}", [getattr(one, name) for one in moved], unit) for name, (text, unit) in
             names.items()]  # fmt: skip
 

@@ -13,6 +13,7 @@ WITH_OPTIONS = {
     "dearest": "--seconds",
     "many-tiles": "--tiles",
     "router-loss": "--kills",
+    "district-move": "--tiles",
     "endings": "--cases",
     "page": "--gaussians",
 }

@@ -108,7 +108,12 @@ def test_a_postponed_tile_waits_and_counts_its_attempts(store: Store, clock: Clo
     store.postpone(claim, 3.0)
     assert store.claim("m2", 1, 10.0) == []
     clock.advance(3.0)
-    assert only_claim(store, "m2").attempts == 2
+    again = only_claim(store, "m2")
+    assert again.attempts == 2
+    assert store.begin([again], 10.0) == [True]
+    store.postpone(again, 1.0, blameless=True)
+    clock.advance(1.0)
+    assert only_claim(store, "m1").attempts == 2, "the second attempt does not count"
 
 
 def test_only_the_holder_can_postpone(store: Store, clock: Clock) -> None:
