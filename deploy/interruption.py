@@ -9,7 +9,7 @@ from types import FrameType
 from gnd.ending import ORDERLY_S, orderly
 
 
-class Ending(threading.Event):
+class EndEvent(threading.Event):
     """Is set by Ctrl-C or SIGTERM.
 
     Attributes:
@@ -20,14 +20,14 @@ class Ending(threading.Event):
 
 
 @contextmanager
-def ending_in_order(*, is_awaited: bool = True, within_s: float = ORDERLY_S) -> Iterator[Ending]:
+def ending_in_order(*, is_awaited: bool = True, within_s: float = ORDERLY_S) -> Iterator[EndEvent]:
     """Give an event that Ctrl-C or SIGTERM sets; the second one raises KeyboardInterrupt.
 
     Args:
         is_awaited: whether the event is looked at from the first; who looks at it only later says so by its attribute.
         within_s: so long after the first signal the program is killed.
     """
-    stop = Ending()
+    stop = EndEvent()
     stop.is_awaited = is_awaited
 
     def end(_number: int, _frame: FrameType | None) -> None:

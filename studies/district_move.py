@@ -70,7 +70,7 @@ OPTIONS: Final = DistrictMoveOptions
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class DistrictMoved:
     """One move.
 
     Attributes:
@@ -182,7 +182,7 @@ def _figure(name: str, found: list[float], unit: str) -> Figure:
     return Figure(name, max(found), unit, f"the worst of {len(found)}; mean {sum(found) / len(found):.2f}")
 
 
-def _moved(options: DistrictMoveOptions) -> Moved:
+def _moved(options: DistrictMoveOptions) -> DistrictMoved:
     with tempfile.TemporaryDirectory(prefix="gnd-move-", ignore_cleanup_errors=True) as name, ExitStack() as stack:
         folder, first = Path(name), base_tile(options.voxels)
         begin = first.tile_id.district.first_morton
@@ -206,7 +206,7 @@ def _moved(options: DistrictMoveOptions) -> Moved:
         seconds = time.monotonic() - began_s
         for driving in drivings:
             driving.goes_on()
-        return Moved(
+        return DistrictMoved(
             gap_s=float(told["districts"][0]["gap_s"]),
             seconds=seconds,
             refused=sum(one.refused for one in drivings),

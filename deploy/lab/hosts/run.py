@@ -12,7 +12,7 @@ from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
 from gnd.deploy.chaos.run import HURRIED_S, RETRY_S
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.errors import LabError
-from gnd.deploy.interruption import Ending
+from gnd.deploy.interruption import EndEvent
 from gnd.deploy.lab.hosts.chaos import LabChaos, lab_chaos
 from gnd.deploy.lab.hosts.cloud import HEARD_SUFFIX, LabFolders, client_names, read_times
 from gnd.deploy.lab.hosts.faults import HostFault, HowMuch, begin_fault, is_back
@@ -85,7 +85,7 @@ def run_hosts(
     lab: Lab,
     folders: LabFolders,
     options: HostsOptions,
-    stop: Ending,
+    stop: EndEvent,
     on_step: OnHostsStep = lambda _what, _n: None,
 ) -> HostsOutcome:
     """Run the laboratory, inflict the faults, let it settle and look at what is left.
@@ -156,7 +156,7 @@ class _Course:
         self,
         cloud: HostsCloud,
         options: HostsOptions,
-        stop: Ending,
+        stop: EndEvent,
         on_step: OnHostsStep,
         chaos: LabChaos | None,
     ) -> None:
