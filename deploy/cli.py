@@ -56,6 +56,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "localise": ("gnd.vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
     "play": ("gnd.deploy.play:play_command", "Publish a recording as sensors would: ROS 2 topics, or plain keys."),
+    "status": (
+        "gnd.deploy.status.command:status",
+        "How the cloud and its vehicles stand; live, or as a check for monitoring.",
+    ),
     "doctor": ("gnd.deploy.doctor.command:doctor", "What keeps programs from working here, and what to do about it."),
     "bench": (
         "gnd.deploy.bench.command:bench",
@@ -120,7 +124,9 @@ def main() -> None:
     tell_compiling(say_progress())
     try:
         with explained(), working():
-            gnd.main(standalone_mode=False)
+            code = gnd.main(standalone_mode=False)
+        if isinstance(code, int) and code:  # of `context.exit`; commands return nothing else
+            sys.exit(code)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)

@@ -1,5 +1,7 @@
 """`gnd config`: show and check settings without running anything."""
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,25 @@ def show(program: str, part: str) -> None:
 def check(program: str, file: Path) -> None:
     """Check FILE as `gnd PROGRAM --config FILE` would, and print the effective settings."""
     click.echo(settings_text(_loaded(program, file)), nl=False)
+
+
+@config.command(short_help="Thresholds of alerts, and the rules of Prometheus made from them.")
+@click.argument("file", type=click.Path(path_type=Path), required=False)
+@click.option("--rules", is_flag=True, help="Print the rules of Prometheus instead.")
+@click.option("--json", "as_json", is_flag=True, help="Print the thresholds as JSON.")
+def alerts(file: Path | None, rules: bool, as_json: bool) -> None:
+    """The thresholds of FILE (TOML; without one the defaults), as `gnd status --alerts` takes them.
+
+    An unknown name or a value out of range is an error. With --rules: what Prometheus is to be given.
+    """
+    from gnd.deploy.status.alert_rules import alert_rules
+    from gnd.deploy.status.thresholds import load_thresholds
+
+    thresholds = load_thresholds(file)
+    if as_json:
+        click.echo(json.dumps(asdict(thresholds), indent=1))
+    else:
+        click.echo(alert_rules(thresholds) if rules else settings_text(thresholds), nl=False)
 
 
 def _loaded(program: str, file: Path) -> Any:

@@ -53,6 +53,8 @@ class StoreCollector(Collector):
         for name, n_bytes in store.sizes().items():
             size.add_metric([name], n_bytes)
         yield size
+        if (free := store.disk_free_bytes()) is not None:
+            yield _gauge("gnd_store_disk_free_bytes", "Room on the disk of the store's file.", free)
 
 
 def store_checks(store: SqlStore, bus: Bus) -> dict[str, Check]:

@@ -1,6 +1,7 @@
 """The store in one SQLite file that several processes of a machine may open (WAL, every commit synced)."""
 
 import logging
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -164,6 +165,10 @@ class SqlStore(ABC):
     @abstractmethod
     def sizes(self) -> dict[str, int]:
         """What the store takes on disk, bytes, by part."""
+
+    def disk_free_bytes(self) -> int | None:
+        """Room on the disk of the store, bytes; None: it is not known, as that of a database's host."""
+        return None
 
     def _steady_ns(self) -> int:
         return self._clock.steady_ns()
@@ -853,6 +858,10 @@ class SqliteStore(SqlStore):
     def sizes(self) -> dict[str, int]:
         """Of the file ("store") and of its log."""
         return {name: _size(Path(f"{self.path}{suffix}")) for name, suffix in (("store", ""), ("-wal", "-wal"))}
+
+    def disk_free_bytes(self) -> int | None:
+        """Of the file."""
+        return shutil.disk_usage(Path(self.path).absolute().parent).free
 
 
 def _size(path: Path) -> int:

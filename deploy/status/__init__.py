@@ -1,0 +1,1 @@
+"""`gnd status`: how the cloud and its vehicles stand, and what an operator should look at."""
