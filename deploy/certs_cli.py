@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from gnd.answers import json_option, tell
 from gnd.deploy.errors import DeployError
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -32,12 +33,15 @@ def certs() -> None:
 @certs.command(short_help="Make an authority.")
 @_AUTHORITY
 @click.option("--name", default="GND fleet", show_default=True, help="Its common name.")
-def init(authority: Path, name: str) -> None:
+@json_option
+def init(authority: Path, name: str, as_json: bool) -> None:
     """Make an authority: a root that holds ten years, and an empty register. Its folder belongs on no server."""
     from gnd.fleet_bus.identity.authority import Authority
 
     Authority.create(authority, name)
-    click.echo(f"authority {name!r} in {authority}: keep {authority / 'key.pem'} where no server reads it")
+    key = authority / "key.pem"
+    values = {"authority": str(authority), "name": name, "key": str(key)}
+    tell(values, as_json, f"authority {name!r} in {authority}: keep {key} where no server reads it")
 
 
 def _issuing(role: str) -> click.Command:
@@ -49,21 +53,25 @@ def _issuing(role: str) -> click.Command:
     @_TO
     @_CONNECT
     @_IDENTITY
-    def issue(name: str, authority: Path, out: Path | None, owner: str, days: float, **options: Any) -> None:
+    @json_option
+    def issue(
+        name: str, authority: Path, out: Path | None, owner: str, days: float, as_json: bool, **options: Any
+    ) -> None:
         from gnd.fleet_bus.identity.authority import Authority
 
         opened, member = Authority(authority), MemberName(role, name)
         folder = out or Path(member.common_name)
         hosts = options.pop("hosts", ())
         entry = opened.issue(member, folder, owner=owner, hosts=hosts, days=days)
-        click.echo(f"{member.common_name} in {folder}, until {entry.ends}")
-        _publish(opened, **options)
+        told = _publish(opened, **options)
+        values = {"member": member.common_name, "folder": str(folder), "ends": entry.ends, "told": told}
+        tell(values, as_json, f"{member.common_name} in {folder}, until {entry.ends}", *_told(told))
 
     issue.__doc__ = f"Issue the identity of the {_SPOKEN[role]} NAME, and say so to routers."
     if role == "router":
         host = click.option("--host", "hosts", multiple=True, help="Name or address under which it is reached.")
         issue = host(issue)
-    return click.command(name=role, short_help=f"Issue the identity of a {_SPOKEN[role]}.")(issue)
+    return click.command(name=role, short_help=f"Issue the identity of {_ARTICLES.get(role, 'a')} {_SPOKEN[role]}.")(issue)
 
 
 _SPOKEN = {
@@ -73,6 +81,7 @@ _SPOKEN = {
     "operator": "operator",
     "router": "router",
 }
+_ARTICLES = {"operator": "an"}
 for _role in ROLES:
     certs.add_command(_issuing(_role))
 
@@ -87,7 +96,8 @@ for _role in ROLES:
 @_TO
 @_CONNECT
 @_IDENTITY
-def pseudonyms(name: str, authority: Path, out: Path | None, owner: str, **options: Any) -> None:
+@json_option
+def pseudonyms(name: str, authority: Path, out: Path | None, owner: str, as_json: bool, **options: Any) -> None:
     """Issue the vehicle NAME an identity for each day, under names that tell nobody but the authority whose they are.
 
     What the folder holds already stays. `gnd agent --identity FOLDER` takes the present one for each trip.
@@ -99,8 +109,9 @@ def pseudonyms(name: str, authority: Path, out: Path | None, owner: str, **optio
     count, hours = options.pop("count"), options.pop("hours")
     issued = issue_pseudonyms(opened, name, folder, count=count, hours=hours, owner=owner)
     last = f", the last until {issued[-1].ends}" if issued else ""
-    click.echo(f"{len(issued)} of {count} pseudonyms of {name} are new in {folder}{last}")
-    _publish(opened, **options)
+    told = _publish(opened, **options)
+    values = {"vehicle": name, "folder": str(folder), "count": count, "new": len(issued), "told": told}
+    tell(values, as_json, f"{len(issued)} of {count} pseudonyms of {name} are new in {folder}{last}", *_told(told))
 
 
 @certs.command(short_help="Whose a pseudonym is.")
@@ -132,7 +143,8 @@ def whose(names: tuple[str, ...], authority: Path, every: bool, as_json: bool) -
 @_TO
 @_CONNECT
 @_IDENTITY
-def revoke(member: str, authority: Path, **options: Any) -> None:
+@json_option
+def revoke(member: str, authority: Path, as_json: bool, **options: Any) -> None:
     """Take back every certificate of MEMBER, such as vehicle.v-17, and tell routers: they cut it off within seconds.
 
     Of a vehicle all its pseudonyms are taken back, too.
@@ -141,12 +153,12 @@ def revoke(member: str, authority: Path, **options: Any) -> None:
     from gnd.fleet_bus.identity.pseudonyms import with_pseudonyms
 
     opened = Authority(authority)
-    for one in with_pseudonyms(opened, MemberName.parse(member)):
-        for entry in opened.revoke(one):
-            click.echo(
-                f"{one.common_name}: certificate {entry.serial} is revoked; it would have held until {entry.ends}"
-            )
-    _publish(opened, **options)
+    names = with_pseudonyms(opened, MemberName.parse(member))
+    gone = [(one.common_name, entry) for one in names for entry in opened.revoke(one)]
+    lines = [f"{one}: certificate {of.serial} is revoked; it would have held until {of.ends}" for one, of in gone]
+    told = _publish(opened, **options)
+    revoked = [{"member": one, "serial": entry.serial, "ends": entry.ends} for one, entry in gone]
+    tell({"revoked": revoked, "told": told}, as_json, *lines, *_told(told))
 
 
 @certs.command(short_help="Tell routers who belongs and who is revoked.")
@@ -154,13 +166,16 @@ def revoke(member: str, authority: Path, **options: Any) -> None:
 @_TO
 @_CONNECT
 @_IDENTITY
-def publish(authority: Path, **options: Any) -> None:
+@json_option
+def publish(authority: Path, as_json: bool, **options: Any) -> None:
     """Put the lists of members and of the revoked into identity folders (--to), or on the bus (--connect)."""
     from gnd.fleet_bus.identity.authority import Authority
 
     if not options["folders"] and options["connect"] is None:
         raise DeployError("nobody to tell: name --to FOLDER or --connect ENDPOINT")
-    _publish(Authority(authority), **options)
+    told, folders = _publish(Authority(authority), **options), [str(one) for one in options["folders"]]
+    lines = [f"members and revoked are in {folder}" for folder in folders]
+    tell({"folders": folders, "told": told}, as_json, *lines, *_told(told))
 
 
 @certs.command(short_help="Sign a router's list of members with a PKI of your own.")
@@ -168,7 +183,8 @@ def publish(authority: Path, **options: Any) -> None:
 @click.option("--key", type=PATH, required=True, help="Private key of an authority that the router trusts, PEM.")
 @click.option("--to", "folder", type=PATH, required=True, help="Identity folder of the router.")
 @click.option("--revoked", multiple=True, metavar="MEMBER", help="Who is shut out; repeatable.")
-def members(names: tuple[str, ...], key: Path, folder: Path, revoked: tuple[str, ...]) -> None:
+@json_option
+def members(names: tuple[str, ...], key: Path, folder: Path, revoked: tuple[str, ...], as_json: bool) -> None:
     """Sign the list of all members, for a router whose certificates do not come from `gnd certs`.
 
     A MEMBER is a name such as vehicle.v-17, or a certificate in PEM. The list replaces the one in the folder under the
@@ -177,7 +193,10 @@ def members(names: tuple[str, ...], key: Path, folder: Path, revoked: tuple[str,
     from gnd.fleet_bus.identity.foreign import sign_members
 
     listed = sign_members(folder, key, map(_named, names), map(_named, revoked))
-    click.echo(f"list {listed.number} in {folder}: {len(listed.members)} members, {len(listed.revoked)} shut out")
+    values = {"folder": str(folder), "number": listed.number}
+    values |= {"members": len(listed.members), "revoked": len(listed.revoked)}
+    line = f"list {listed.number} in {folder}: {len(listed.members)} members, {len(listed.revoked)} shut out"
+    tell(values, as_json, line)
 
 
 def _named(text: str) -> MemberName:
@@ -192,7 +211,8 @@ def _named(text: str) -> MemberName:
 @_AUTHORITY
 @_DAYS
 @click.option("--all", "every", is_flag=True, help="Those too that hold for long yet.")
-def renew(folders: tuple[Path, ...], authority: Path, days: float, every: bool) -> None:
+@json_option
+def renew(folders: tuple[Path, ...], authority: Path, days: float, every: bool, as_json: bool) -> None:
     """Renew the identities in FOLDERS that end soon (in less than a quarter of their time), with new keys.
 
     A running process takes the new certificate from its folder by itself.
@@ -200,14 +220,15 @@ def renew(folders: tuple[Path, ...], authority: Path, days: float, every: bool) 
     from gnd.fleet_bus.identity.authority import Authority
     from gnd.fleet_bus.identity.folder import load_identity
 
-    opened = Authority(authority)
+    opened, rows = Authority(authority), []
     for folder in folders:
         identity = load_identity(folder)
-        if every or identity.ends_soon():
-            entry = opened.renew(folder, days)
-            click.echo(f"{identity.member.common_name} in {folder}: renewed until {entry.ends}")
-        else:
-            click.echo(f"{identity.member.common_name} in {folder}: holds until {identity.ends.isoformat()}")
+        is_new = every or identity.ends_soon()
+        ends = opened.renew(folder, days).ends if is_new else identity.ends.isoformat()
+        rows.append({"member": identity.member.common_name, "folder": str(folder), "renewed": is_new, "ends": ends})
+    words = {True: "renewed", False: "holds"}
+    lines = [f"{row['member']} in {row['folder']}: {words[bool(row['renewed'])]} until {row['ends']}" for row in rows]
+    tell({"identities": rows}, as_json, *lines)
 
 
 @certs.command(name="list", short_help="What was issued.")
@@ -232,7 +253,8 @@ def list_(authority: Path, as_json: bool) -> None:
 @certs.command(short_help="What is wrong with an identity folder.")
 @click.argument("folder", type=PATH)
 @click.option("--connect", help="Also try this router, tls/host:port.")
-def check(folder: Path, connect: str | None) -> None:
+@json_option
+def check(folder: Path, connect: str | None, as_json: bool) -> None:
     """Check the identity in FOLDER, from whatever PKI it comes: files, key, chain, name, time, list of the revoked."""
     from gnd.fleet_bus.identity.cause import why_not
     from gnd.fleet_bus.identity.folder import load_identity, problems
@@ -244,17 +266,22 @@ def check(folder: Path, connect: str | None) -> None:
         found = [f"{connect}: {cause}"] if cause else []
     if found:
         raise IdentityError("; ".join(found))
-    click.echo(
-        f"{identity.member.common_name} ({identity.owner or 'no owner'}): holds until {identity.ends.isoformat()}"
-    )
+    name, ends = identity.member.common_name, identity.ends.isoformat()
+    values = {"member": name, "owner": identity.owner, "ends": ends}
+    tell(values, as_json, f"{name} ({identity.owner or 'no owner'}): holds until {ends}")
 
 
-def _publish(authority: Any, folders: tuple[Path, ...], connect: str | None, identity: Path | None) -> None:
+def _publish(authority: Any, folders: tuple[Path, ...], connect: str | None, identity: Path | None) -> str | None:
+    """Put the lists into folders and on the bus; gives the router that was told."""
     authority.copy_lists(folders)
     if connect is None:
-        return
+        return None
     config = BusConfig(connect=(connect,), identity=identity or identity_of_environment())
     with open_bus(config, name="certs") as bus:
         for name, data in zip(("members", "revoked"), authority.lists(), strict=True):
             bus.publish(authority_key(name), data, kind="control")
-    click.echo(f"told {connect}")
+    return connect
+
+
+def _told(router: str | None) -> list[str]:
+    return [] if router is None else [f"told {router}"]

@@ -65,6 +65,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "gnd.deploy.bench.command:bench",
         "What a vehicle costs on this machine: CPU, memory and start, by stage.",
     ),
+    "completion": ("gnd.deploy.completion_cli:completion", "Tab completion for bash, zsh and fish."),
     "config": ("gnd.deploy.config_cli:config", "Show and check the settings of the programs."),
     "sim": ("gnd.fleet_sim.cli:sim", "Write and inspect simulated worlds and drives."),
     "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and compare them with ours."),

@@ -1,12 +1,13 @@
 """`gnd config`: show and check settings without running anything."""
 
-import json
+import tomllib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
+from gnd.answers import json_option, tell
 from gnd.deploy.configuration_page import PROGRAMS, settings_class
 from gnd.deploy.errors import DeployError
 from gnd.gnd_map.settings import described, settings_text
@@ -22,31 +23,35 @@ def config() -> None:
 @config.command(short_help="Name, default, unit, range and effect of settings.")
 @_PROGRAM
 @click.argument("part", default="")
-def show(program: str, part: str) -> None:
+@json_option
+def show(program: str, part: str, as_json: bool) -> None:
     """The settings of PROGRAM whose names contain PART."""
     rows = [row for row in described(settings_class(program)) if part in row.path]
     if not rows:
         raise DeployError(f"no setting of gnd {program} holds {part!r}")
+    lines = []
     for row in rows:
         told = row.setting
         unit = f" {told.unit}" if told.unit else ""
-        click.echo(
-            f"{row.path} = {row.default or '(must be given)'}{unit}  [{told.range or row.kind}]\n    {told.effect}"
-        )
+        lines.append(f"{row.path} = {row.default or '(must be given)'}{unit}  [{told.range or row.kind}]")
+        lines.append(f"    {told.effect}")
+    tell({"program": program, "settings": [asdict(row) for row in rows]}, as_json, *lines)
 
 
 @config.command(short_help="Check a file of settings.")
 @_PROGRAM
 @click.argument("file", type=click.Path(path_type=Path))
-def check(program: str, file: Path) -> None:
+@json_option
+def check(program: str, file: Path, as_json: bool) -> None:
     """Check FILE as `gnd PROGRAM --config FILE` would, and print the effective settings."""
-    click.echo(settings_text(_loaded(program, file)), nl=False)
+    text = settings_text(_loaded(program, file))
+    tell(tomllib.loads(text), as_json, text.rstrip("\n"))
 
 
 @config.command(short_help="Thresholds of alerts, and the rules of Prometheus made from them.")
 @click.argument("file", type=click.Path(path_type=Path), required=False)
 @click.option("--rules", is_flag=True, help="Print the rules of Prometheus instead.")
-@click.option("--json", "as_json", is_flag=True, help="Print the thresholds as JSON.")
+@json_option
 def alerts(file: Path | None, rules: bool, as_json: bool) -> None:
     """The thresholds of FILE (TOML; without one the defaults), as `gnd status --alerts` takes them.
 
@@ -56,10 +61,8 @@ def alerts(file: Path | None, rules: bool, as_json: bool) -> None:
     from gnd.deploy.status.thresholds import load_thresholds
 
     thresholds = load_thresholds(file)
-    if as_json:
-        click.echo(json.dumps(asdict(thresholds), indent=1))
-    else:
-        click.echo(alert_rules(thresholds) if rules else settings_text(thresholds), nl=False)
+    text = alert_rules(thresholds) if rules else settings_text(thresholds)
+    tell(asdict(thresholds), as_json, text.rstrip("\n"))
 
 
 def _loaded(program: str, file: Path) -> Any:

@@ -8,6 +8,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd.answers import tell
 from gnd.deploy.lane_edits import MapEdits, lane_edits, map_pieces, painted
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.gnd_map.features import Feature
@@ -103,12 +104,13 @@ def edits(
 @click.argument("file", metavar="MAP.osm", type=PATH)
 @click.argument("change", metavar="EDITS.osc", type=PATH)
 @click.argument("out", metavar="OUT.osm", type=PATH)
-def apply(file: Path, change: Path, out: Path) -> None:
+@json_option
+def apply(file: Path, change: Path, out: Path, as_json: bool) -> None:
     """Write MAP.osm with all edits of EDITS.osc to OUT.osm; an edit that does not fit refuses all."""
     limit = MAX_FILE_BYTES
     data = apply_osm_change(read_bytes(file, limit), read_bytes(change, limit), str(file))
     write_whole(out, data)
-    click.echo(f"{out}: {len(data)} bytes")
+    tell({"file": str(out), "size_bytes": len(data)}, as_json, f"{out}: {len(data)} bytes")
 
 
 def _values(found: MapEdits) -> dict[str, Any]:

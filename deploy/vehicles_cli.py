@@ -8,6 +8,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd.answers import tell
 from gnd.cloud_merger.groups import groups_of
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.location import LOCATION, StoreLocation, shown
@@ -58,7 +59,8 @@ def why_command(path: StoreLocation, vehicle: str, as_json: bool) -> None:
 @click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("vehicle")
 @click.option("--why", required=True, help="The reason, in a line; it is kept and shown.")
-def quarantine_command(path: StoreLocation, vehicle: str, why: str) -> None:
+@json_option
+def quarantine_command(path: StoreLocation, vehicle: str, why: str, as_json: bool) -> None:
     """Let the reports of VEHICLE count no more, until `gnd vehicles release`.
 
     Tiles whose open window holds its reports are merged again without them by the running shards. What was folded
@@ -66,18 +68,19 @@ def quarantine_command(path: StoreLocation, vehicle: str, why: str) -> None:
     """
     with existing(path) as store:
         store.quarantine_vehicle(vehicle, why)
-    click.echo(f"{vehicle} is quarantined: {why}")
+    tell({"vehicle": vehicle, "is_quarantined": True, "why": why}, as_json, f"{vehicle} is quarantined: {why}")
 
 
 @vehicles.command("release", short_help="Let the reports of a vehicle count again.")
 @click.argument("path", metavar="STORE", type=LOCATION)
 @click.argument("vehicle")
-def release_command(path: StoreLocation, vehicle: str) -> None:
+@json_option
+def release_command(path: StoreLocation, vehicle: str, as_json: bool) -> None:
     """Let the reports of VEHICLE count again, and pardon what was held against it until now."""
     with existing(path) as store:
         if not store.release_vehicle(vehicle):
             raise StoreError(f"{vehicle} is not quarantined in {shown(path)}")
-    click.echo(f"{vehicle} counts again")
+    tell({"vehicle": vehicle, "is_quarantined": False}, as_json, f"{vehicle} counts again")
 
 
 def account_of(store: Store, vehicle: str) -> dict[str, Any]:

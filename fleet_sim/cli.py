@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from gnd.answers import json_option, tell
 from gnd.fleet_sim.families.names import FAMILY_NAMES
 from gnd.fleet_sim.sensing import BEAMS, WEATHERS, Beams, Weather
 from gnd.fleet_sim.sensors import SHORT_NAMES
@@ -35,11 +36,13 @@ def world() -> None:
 @click.option("--family", type=click.Choice(FAMILY_NAMES), default="street", show_default=True, help="Kind of place.")
 @click.option("--parking", type=float, help="Share of parking slots that are taken on its drives, 0 to 1.")
 @click.option("--edits", "edit_share", default=1.0, show_default=True, help="Share of the street's edits to make.")
-def write(file: Path, seed: int, **options: Any) -> None:
+@json_option
+def write(file: Path, seed: int, as_json: bool, **options: Any) -> None:
     """Write the street of a seed to FILE (JSON)."""
     made = street(seed, StreetOptions(**options))
     write_world(made, file)
-    click.echo(f"{file}: {len(made.objects)} objects, {options['length_m']:g} m, {options['family']}, seed {seed}")
+    line = f"{file}: {len(made.objects)} objects, {options['length_m']:g} m, {options['family']}, seed {seed}"
+    tell({"file": file, "objects": len(made.objects), "seed": seed} | options, as_json, line)
 
 
 @world.command("inspect")
@@ -58,7 +61,8 @@ def inspect(file: Path, as_json: bool) -> None:
 @click.option(
     "--dpi", type=click.IntRange(40, 300), default=150, show_default=True, help="Dots an inch, of 12.6 inches."
 )
-def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
+@json_option
+def picture(file: Path, png: Path, truth_file: Path | None, dpi: int, as_json: bool) -> None:
     """Draw what changes in the world of FILE, as classes of voxels (some 10 s for 200 m without a kept truth)."""
     from gnd.fleet_sim.ellipsoids import ellipsoids_of_truth
     from gnd.fleet_sim.pictures import draw_map
@@ -67,22 +71,25 @@ def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
     made = read_world(file)
     truth = load_or_make_truth(made, truth_file) if truth_file else make_truth(made)
     draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}{_family(made)}", _note(made), dpi=dpi)
-    click.echo(f"{png}: {', '.join(f'{n} {name}' for name, n in truth.counts('all').items())}")
+    counts = truth.counts("all")
+    tell({"file": png, "voxels": counts}, as_json, f"{png}: {', '.join(f'{n} {name}' for name, n in counts.items())}")
 
 
 @world.command("features")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("layers", type=click.Path(path_type=Path))
 @click.option("--mapped-streetlights", default=0.0, show_default=True, help="Share of the lamps that are in the map.")
-def features(file: Path, layers: Path, mapped_streetlights: float) -> None:
+@json_option
+def features(file: Path, layers: Path, mapped_streetlights: float, as_json: bool) -> None:
     """Write the feature layers of the map before the changes of the world in FILE to LAYERS (JSON)."""
     from gnd.fleet_sim.feature_files import write_feature_layers
     from gnd.fleet_sim.feature_truth import base_features, feature_truth
 
     truth = feature_truth(read_world(file), mapped_streetlights)
     write_feature_layers(base_features(truth), layers)
-    for layer, states in truth.counts().items():
-        click.echo(f"{layer}: {', '.join(f'{n} {state}' for state, n in states.items())}")
+    counts = truth.counts()
+    lines = [f"{layer}: {', '.join(f'{n} {state}' for state, n in states.items())}" for layer, states in counts.items()]
+    tell({"file": layers, "layers": counts}, as_json, *lines)
 
 
 def _family(made: World) -> str:
@@ -108,6 +115,7 @@ def _note(made: World) -> str:
 @click.option("--beams", type=click.Choice(BEAMS), default="ideal", show_default=True, help="Real ones have a width.")
 @click.option("--scans", type=int, help="At most so many scans.")
 @click.option("--camera", is_flag=True, help="A camera that detects traffic signs, too.")
+@json_option
 def drive(
     world_file: Path,
     file: Path,
@@ -122,6 +130,7 @@ def drive(
     beams: Beams,
     scans: int | None,
     camera: bool,
+    as_json: bool,
 ) -> None:
     """Drive through the world of WORLD_FILE and write what the sensors give to FILE (MCAP, opens in Foxglove)."""
     from gnd.fleet_sim.camera import SignCamera
@@ -142,7 +151,8 @@ def drive(
         beams=beams,
     )
     simulate_drive(read_world(world_file), config, file)
-    click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+    size = file.stat().st_size
+    tell({"file": file, "size_bytes": size}, as_json, f"{file}: {size / 1e6:.1f} MB")
 
 
 @sim.group()
@@ -155,7 +165,8 @@ def road() -> None:
 @click.argument("png", type=click.Path(path_type=Path))
 @click.option("--seed", default=11, show_default=True, help="Seed of the road.")
 @click.option("--drive", "drive_seed", default=1, show_default=True, help="Seed of the drive.")
-def road_picture(kind: str, png: Path, seed: int, drive_seed: int) -> None:
+@json_option
+def road_picture(kind: str, png: Path, seed: int, drive_seed: int, as_json: bool) -> None:
     """Draw a road of KIND and one drive along it to PNG."""
     from gnd.fleet_sim.roads.drive import drive_route
     from gnd.fleet_sim.roads.pictures import draw_drive
@@ -164,7 +175,10 @@ def road_picture(kind: str, png: Path, seed: int, drive_seed: int) -> None:
     driven = drive_route(route_named(kind, seed), drive_seed)
     draw_drive(driven, png)
     detections, blind = sum(len(look) for look in driven.looks), int((driven.truth.looks_at == 0).sum())
-    click.echo(
+    line = (
         f"{png}: {driven.route.length_m:.0f} m, {len(driven.looks)} looks, {detections} detections,"
         f" {blind} of {len(driven.route.features)} features hidden all the time"
     )
+    values = {"length_m": driven.route.length_m, "looks": len(driven.looks), "detections": detections}
+    values |= {"features": len(driven.route.features), "hidden": blind}
+    tell({"file": png} | values, as_json, line)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import click
+from click.shell_completion import CompletionItem
 
 from gnd.tile_store.errors import StoreUnavailable
 from gnd.tile_store.signing import Signing
@@ -100,6 +101,10 @@ class _Location(click.ParamType):  # type: ignore[type-arg]  # generic only in n
         """The file, or the text that tells the database."""
         file = file_of(value)
         return str(value) if file is None else file
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002  (click's signature)
+        """Files, as the shell finds them."""
+        return [CompletionItem(incomplete, type="file")]
 
 
 LOCATION: Final = _Location()

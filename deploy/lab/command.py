@@ -7,6 +7,7 @@ from typing import Any
 import click
 from rich.console import Console
 
+from gnd.answers import json_option, tell
 from gnd.deploy.errors import LabError
 from gnd.deploy.fleet_cli import by_part, mark_of, run, run_options, summary_text
 from gnd.deploy.fleet_config import load_fleet_config
@@ -133,14 +134,13 @@ def check(links: str, name: str, relay_all: bool, seconds: float, as_json_: bool
 
 
 @lab.command()
-def clean() -> None:
+@json_option
+def clean(as_json: bool) -> None:
     """Remove namespaces and links that killed labs have left behind; labs that run are left alone."""
     check_rights()
     done = clean_up()
-    for name, removed in done.items():
-        click.echo(f"{name}: {_removed_text(removed)}" if removed else f"{name} runs: left alone")
-    if not done:
-        click.echo("nothing to remove")
+    lines = [f"{one}: {_removed_text(gone)}" if gone else f"{one} runs: left alone" for one, gone in done.items()]
+    tell({"removed": done}, as_json, *(lines or ["nothing to remove"]))
 
 
 def _removed_text(removed: tuple[str, ...]) -> str:
