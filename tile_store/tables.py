@@ -27,7 +27,7 @@ def info(title: str, told: dict[str, Any]) -> Table:
     return fields(
         title,
         {
-            "layer": f"{told['layer']} of {', '.join(told['layers'])}",
+            "layer": _layer(told),
             "region": told["prefix"] or "everywhere",
             "tiles": f"{told['tiles']} in {told['districts']} districts",
             **_content(told),
@@ -42,6 +42,11 @@ def info(title: str, told: dict[str, Any]) -> Table:
             "in quarantine": store["quarantined"],
         },
     )
+
+
+def _layer(told: dict[str, Any]) -> str:
+    others = [name for name in told["layers"] if name != told["layer"]]
+    return f"{told['layer']} (others: {', '.join(others)})" if others else str(told["layer"])
 
 
 def _content(told: dict[str, Any]) -> dict[str, Any]:

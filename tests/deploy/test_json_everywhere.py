@@ -37,6 +37,7 @@ def commands(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[tup
     yield " ".join(path), command
 
 
+@pytest.mark.slow
 def test_every_command_has_json_or_a_reason_why_not() -> None:
     found = dict(commands(gnd))
     assert len(found) > 90

@@ -14,12 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from console_pages import ShownCommand, check_printed, commands_of
 from manifests import DEPLOY, unit_environment, unit_words
 from suite_ports import new_port
 
+from gnd.deploy.cli import gnd
 from gnd.fleet_bus.identity.authority import Authority
-from gnd.fleet_bus.identity.names import MemberName
+from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE, MemberName
+from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveHeader, ReferencePose, Scan
@@ -42,6 +45,10 @@ def write_drive(path: Path, range_m: float) -> None:
             t_ns = 1_700_000_000_000_000_000 + k * 100_000_000
             writer.scan(Scan(t_ns, wall.astype(np.float32), np.zeros(3000, np.uint32)))
             writer.reference(ReferencePose(t_ns, np.eye(4)))
+
+
+Done = tuple[int, str, str]
+"""Exit code, standard output, standard error."""
 
 
 @dataclass
@@ -94,10 +101,7 @@ class Server:
             return
         until_s = time.monotonic() + (SETTLES_S if words[:2] == ["gnd", "status"] else 0.0)
         while True:
-            done = subprocess.run(
-                [*GND, *words[1:]] if words[0] == "gnd" else words,
-                cwd=self.folder, capture_output=True, text=True, timeout=300,
-            )  # fmt: skip
+            done = self._gnd(words[1:]) if words[0] == "gnd" else self._shell(words)
             try:
                 self.check(command, done)
             except AssertionError:
@@ -107,15 +111,33 @@ class Server:
             else:
                 return
 
-    def check(self, command: ShownCommand, done: subprocess.CompletedProcess[str]) -> None:
+    def _gnd(self, words: list[str]) -> Done:
+        """Within this process, which has imported everything already."""
+        kept = os.environ.get(IDENTITY_VARIABLE)
+        done = CliRunner().invoke(gnd, words)
+        os.environ.pop(IDENTITY_VARIABLE, None)
+        if kept is not None:
+            os.environ[IDENTITY_VARIABLE] = kept
+        if isinstance(done.exception, GndError):  # as `gnd.deploy.cli.main` says it
+            return 2, done.stdout, f"gnd: {done.exception}\n"
+        assert done.exception is None or isinstance(done.exception, SystemExit), words
+        return done.exit_code, done.stdout, done.stderr
+
+    def _shell(self, words: list[str]) -> Done:
+        done = subprocess.run(words, cwd=self.folder, capture_output=True, text=True, timeout=60)
+        return done.returncode, done.stdout, done.stderr
+
+    def check(self, command: ShownCommand, done: Done) -> None:
+        code, out, err = done
         is_ill = any(line.startswith(("CRITICAL", "gnd: ")) for line in command.shown)
-        said = done.stdout + (done.stderr if is_ill else "")
-        assert (done.returncode != 0) == is_ill, f"$ {command.line}\n{done.stdout}\n{done.stderr}"
+        assert (code != 0) == is_ill, f"$ {command.line}\n{out}\n{err}"
+        said = out + (err if is_ill else "")
         check_printed(command, self.there(said))
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    monkeypatch.chdir(tmp_path)
     made = Server(tmp_path)
     for name in ("etc/gnd", "var/lib/gnd"):
         (tmp_path / name).mkdir(parents=True)
