@@ -71,7 +71,9 @@ def _issuing(role: str) -> click.Command:
     if role == "router":
         host = click.option("--host", "hosts", multiple=True, help="Name or address under which it is reached.")
         issue = host(issue)
-    return click.command(name=role, short_help=f"Issue the identity of {_ARTICLES.get(role, 'a')} {_SPOKEN[role]}.")(issue)
+    return click.command(name=role, short_help=f"Issue the identity of {_ARTICLES.get(role, 'a')} {_SPOKEN[role]}.")(
+        issue
+    )
 
 
 _SPOKEN = {

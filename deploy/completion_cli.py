@@ -29,7 +29,9 @@ def completion(shell: str, *, install: bool) -> None:
     path = installed_path(shell)
     try:
         if path.exists() and VARIABLE not in path.read_text(encoding="utf-8", errors="replace"):
-            raise DeployError(f"{path} is there and not ours: move it away, or append what `gnd completion {shell}` prints")
+            raise DeployError(
+                f"{path} is there and not ours: move it away, or append what `gnd completion {shell}` prints"
+            )
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(source, encoding="utf-8")
     except OSError as error:

@@ -29,7 +29,12 @@ PATH: Final = click.Path(path_type=Path)
 @click.option("--alerts", "file", type=PATH, help="Thresholds (TOML).  [default: those of `gnd config alerts`]")
 @click.option("--connect", help="Router where vehicles are heard.  [default: that of RUN while it is going]")
 @click.option(
-    "--every", "every_s", type=click.FloatRange(0.1, 3600.0), default=1.0, show_default=True, help="Seconds between looks."
+    "--every",
+    "every_s",
+    type=click.FloatRange(0.1, 3600.0),
+    default=1.0,
+    show_default=True,
+    help="Seconds between looks.",
 )
 @json_option
 @identity_option

@@ -88,7 +88,8 @@ def cloud_lines(view: RoomView) -> dict[str, str]:
         "from receipt to version": _lag(view),
         "set aside": f"{_counted(figures.tiles_set_aside, 'tile')}",
         "waiting for confirmation": _waiting(figures.waiting),
-        "releases": f"{_counted(figures.on_trial, 'version')} on trial" + (f", {figures.paused} paused" * (figures.paused > 0)),
+        "releases": f"{_counted(figures.on_trial, 'version')} on trial"
+        + (f", {figures.paused} paused" * (figures.paused > 0)),
         "quarantine": f"{_counted(queue.quarantined, 'message')}, {size_text(queue.quarantined_bytes)}",
         "vehicles not counted": _listed([f"{name} ({why})" for name, why in figures.not_counted.items()], "none"),
     }

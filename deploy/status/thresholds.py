@@ -21,14 +21,18 @@ class AlertThresholds:
     tiles_set_aside: int = setting(0, "Most tiles that cannot be merged.", least=0)
     merges_failed_share: float = setting(0.05, "Largest share of merges that fail (rules alone).", above=0, most=1)
     store_failures: float = setting(5.0, "Most failed calls of the store in 5 min (rules alone).", least=0)
-    quarantine_mb: float = setting(48.0, "Most refused messages that are kept; the oldest go at 64.", unit="MB", above=0)
+    quarantine_mb: float = setting(
+        48.0, "Most refused messages that are kept; the oldest go at 64.", unit="MB", above=0
+    )
     disk_low_gb: float = setting(5.0, "Room on the store's disk below which a warning is raised.", unit="GB", above=0)
     disk_full_gb: float = setting(0.5, "Room below which it is critical.", unit="GB", above=0)
     certificate_days: float = setting(7.0, "A certificate that holds less is a warning.", unit="days", above=0)
     certificate_hours: float = setting(36.0, "A certificate that holds less is critical.", unit="h", above=0)
     refusals_per_s: float = setting(1.0, "Most refusals of one kind and reason (rules alone).", unit="1/s", above=0)
     vehicles_held_back: int = setting(0, "Most vehicles that send more than their share (rules alone).", least=0)
-    descriptors_share: float = setting(0.8, "Largest share of open files of those allowed (rules alone).", above=0, most=1)
+    descriptors_share: float = setting(
+        0.8, "Largest share of open files of those allowed (rules alone).", above=0, most=1
+    )
 
     def __post_init__(self) -> None:
         check_settings(self, ConfigError)

@@ -3,7 +3,7 @@
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -155,18 +155,18 @@ def _tell(
     try:
         view = room.look()
     except GndError as error:
-        _say(live, console, lambda: json.dumps({"error": str(error)}) if as_json else f"CRITICAL: {error}")
+        _say(live, console, json.dumps({"error": str(error)}) if as_json else f"CRITICAL: {error}")
         return False
     if live is not None:
         live.update(screen(view, fleet, hint), refresh=True)
     else:
-        _say(None, console, lambda: json.dumps(told(view, fleet)) if as_json else one_line(view, fleet))
+        _say(None, console, json.dumps(told(view, fleet)) if as_json else one_line(view, fleet))
     return True
 
 
-def _say(live: Live | None, console: Console, line: Callable[[], str]) -> None:
+def _say(live: Live | None, console: Console, line: str) -> None:
     if live is not None:
-        live.update(Text(line(), style="bold red"), refresh=True)
+        live.update(Text(line, style="bold red"), refresh=True)
     else:
-        console.print(line(), soft_wrap=True, highlight=False, markup=False)
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
         console.file.flush()

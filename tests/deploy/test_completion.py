@@ -40,7 +40,9 @@ def in_bash(line: str, home: dict[str, str], *before: str) -> list[str]:
     script = "; ".join(
         [*before, f"COMP_WORDS=({' '.join(words)} {'' if words[-1] else chr(39) * 2})", f"COMP_CWORD={len(words) - 1}"]
     )
-    return ran(["bash", "--norc", "-c", f'{script}; _gnd_completion gnd; printf "%s\\n" "${{COMPREPLY[@]}}"'], home).split()
+    return ran(
+        ["bash", "--norc", "-c", f'{script}; _gnd_completion gnd; printf "%s\\n" "${{COMPREPLY[@]}}"'], home
+    ).split()
 
 
 def test_bash_completes_commands_options_and_values(home: dict[str, str]) -> None:

@@ -162,7 +162,10 @@ def an_expired_certificate(server: Server) -> None:
     )
 
 
-BEFORE: dict[str, Callable[[Server], None]] = {"gnd map history": a_bad_survey, "gnd certs list": an_expired_certificate}
+BEFORE: dict[str, Callable[[Server], None]] = {
+    "gnd map history": a_bad_survey,
+    "gnd certs list": an_expired_certificate,
+}
 """What happens to the server before a command, by its beginning."""
 
 

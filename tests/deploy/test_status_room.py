@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,10 @@ def fill(location: StoreLocation) -> StoreLocation:
         mean_m, cov_m2 = np.zeros((1, 3), np.float32), np.array([[0.01, 0, 0, 0.01, 0, 0.01]], np.float32)
         store.put_tiles([Tile(tile, 0, Gaussians(one, one * 100, one * 25, mean_m, cov_m2)) for tile in (TILE, EAST)])
         store.put_reports(
-            [ReportRow(deterministic_report_id(n, "v1"), "ndt", tile, "v1", time.time_ns(), b"body") for n, tile in enumerate((TILE, EAST))]
+            [
+                ReportRow(deterministic_report_id(n, "v1"), "ndt", tile, "v1", time.time_ns(), b"body")
+                for n, tile in enumerate((TILE, EAST))
+            ]
         )
         store.join("shard-0")
         claims = store.claim("shard-0", 2, 60.0)
@@ -235,10 +238,8 @@ class Terminal:
         while time.monotonic() < end_s:
             with_output = select.select([self.number], [], [], 0.1)[0]
             if with_output:
-                try:
+                with suppress(OSError):  # the terminal's other end is closed
                     os.read(self.number, 65536)
-                except OSError:
-                    pass  # the terminal's other end is closed
             pid, code = os.waitpid(self.pid, os.WNOHANG)
             if pid:
                 return os.waitstatus_to_exitcode(code)
@@ -279,9 +280,7 @@ def test_a_view_in_a_terminal_follows_the_store_and_ends_cleanly(tmp_path: Path,
         assert termios.tcgetattr(shown.number)[3] & termios.ICANON, "the terminal is as it was"
 
 
-def test_a_store_that_does_not_answer_is_said_and_asked_again(
-    new_database: Callable[[], str], postgres: Any
-) -> None:
+def test_a_store_that_does_not_answer_is_said_and_asked_again(new_database: Callable[[], str], postgres: Any) -> None:
     url = str(fill(new_database()))
     name = url.partition("?")[0].rpartition("/")[2]
     command = [sys.executable, "-m", "gnd.deploy.cli", "status", url, "--watch", "--json", "--every", "0.2"]
