@@ -23,7 +23,7 @@ class RaisedAlert:
         alert: its name, that of the rule of Prometheus.
         severity: "critical": vehicles notice it, or soon will.
         says: what it is, with figures.
-        do: what to do; docs/runbook.md has it at length.
+        do: what to do; docs/operations.md has it at length.
     """
 
     alert: str
@@ -98,7 +98,7 @@ def _disk(figures: CloudFigures, limits: AlertThresholds) -> Iterator[RaisedAler
     if figures.disk.free_bytes is None:
         return
     free_gb = figures.disk.free_bytes / _GB
-    says, do = f"{free_gb:.2f} GB are free on the store's disk", "free space there, or gnd map gc; docs/runbook.md"
+    says, do = f"{free_gb:.2f} GB are free on the store's disk", "free space there, or gnd map gc"
     if free_gb < limits.disk_full_gb:
         yield RaisedAlert("GndDiskFull", "critical", says, do)
     elif free_gb < limits.disk_low_gb:

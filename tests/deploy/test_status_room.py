@@ -23,17 +23,24 @@ import pytest
 import yaml
 from manifests import DEPLOY
 from metric_names import MONITORING
+from suite_ports import new_port
 
+from gnd.deploy.run_folder import RunFolder
 from gnd.deploy.status import alert_rules as rules
 from gnd.deploy.status.figures import CloudFigures, DiskRoom, look_at
 from gnd.deploy.status.raised import exit_code, raised_by
 from gnd.deploy.status.thresholds import AlertThresholds, load_thresholds
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
 from gnd.gnd_map.errors import ConfigError
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.settings import settings_text
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import traffic_key
 from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.traffic import TrafficSample
 from gnd.tile_store.location import StoreLocation, open_store
 from gnd.tile_store.values import QueueState, ReportRow, ShardSeen, StoreConfig
 
@@ -312,3 +319,32 @@ def test_a_look_changes_nothing(tmp_path: Path) -> None:
     with open_store(path, create=False, read_only=True) as store:
         assert look_at(store, path).parts == 2
     assert path.read_bytes() == before
+
+
+def test_vehicles_of_a_run_are_heard_over_its_router(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run")
+    run.root.mkdir()
+    fill(run.store)
+    endpoint = f"tcp/127.0.0.1:{new_port()}"
+    run.endpoint.write_text(f"{endpoint}\n")
+    run.pids.write_text(json.dumps({"router": os.getpid()}))  # the router below is in this process
+    sample = TrafficSample("car-7", time.time_ns(), 512.0, (), 0, 0, 0.65, 2.2, "degraded", 3, 2)
+    command = [sys.executable, "-m", "gnd.deploy.cli", "status", str(run.root), "--watch", "--json", "--every", "0.2"]
+    with open_router([endpoint]), open_bus(BusConfig(connect=(endpoint,)), name="car-7") as bus:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        try:
+            bus.publish(traffic_key("car-7"), b"no sample", kind="telemetry")  # is noted and left out
+            for line in process.stdout:
+                bus.publish(traffic_key("car-7"), sample.encode(), kind="telemetry")
+                if vehicles := json.loads(line)["vehicles"]:
+                    break
+            assert vehicles == [{"vehicle": "car-7", "health": "degraded", "reports": 2}]
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=60) == 0
+        finally:
+            process.kill()
+            process.wait()
+    run.summary.write_text("{}")  # it has ended: nobody is listened to, the store is shown all the same
+    told = json.loads(gnd("status", run.root, "--json").stdout)
+    assert (told["vehicles"], told["parts"]) == ([], 2)

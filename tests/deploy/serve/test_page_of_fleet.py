@@ -1,9 +1,6 @@
 """A fleet's page follows the run, and whatever happens to it harms nobody."""
 
 import json
-import signal
-import subprocess
-import sys
 import urllib.request
 from collections.abc import Callable
 from typing import Any
@@ -29,21 +26,6 @@ def address_of(run: Run) -> str:
     raise AssertionError("the run has told no address")
 
 
-def status_follows(run: Run) -> None:
-    """`gnd status RUN --watch` sees shards, vehicles and reports of the run."""
-    command = [sys.executable, "-m", "gnd.deploy.cli", "status", str(run.folder), "--watch", "--json", "--every", "0.3"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            told = json.loads(line)
-            known = {one["vehicle"] for one in told["vehicles"] if one.get("drive_km", 0.0) > 0.0}
-            if told["parts"] and len(known) == 2 and any(one["is_alive"] for one in told["shards"]):
-                break
-            assert run.process.poll() is None, f"the run has ended before: {told}"
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 0
-
-
 def test_the_page_follows_a_run_dies_alone_and_the_run_is_served_after_it(start_run: Callable[..., Run]) -> None:
     run = start_run()
     url = address_of(run)
@@ -58,7 +40,6 @@ def test_the_page_follows_a_run_dies_alone_and_the_run_is_served_after_it(start_
     about = asked(url, "api/map")
     assert about["live"] is True
     assert about["tiles"] > 0
-    status_follows(run)
     run.kill("page")
     summary = run.finish()
     assert summary["restarts"] == {}
