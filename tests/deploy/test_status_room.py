@@ -330,8 +330,11 @@ def test_vehicles_of_a_run_are_heard_over_its_router(tmp_path: Path) -> None:
     run.pids.write_text(json.dumps({"router": os.getpid()}))  # the router below is in this process
     sample = TrafficSample("car-7", time.time_ns(), 512.0, (), 0, 0, 0.65, 2.2, "degraded", 3, 2)
     command = [sys.executable, "-m", "gnd.deploy.cli", "status", str(run.root), "--watch", "--json", "--every", "0.2"]
-    with open_router([endpoint]), open_bus(BusConfig(connect=(endpoint,)), name="car-7") as bus:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    with (
+        open_router([endpoint]),
+        open_bus(BusConfig(connect=(endpoint,)), name="car-7") as bus,
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process,
+    ):
         assert process.stdout is not None
         try:
             bus.publish(traffic_key("car-7"), b"no sample", kind="telemetry")  # is noted and left out
@@ -344,7 +347,6 @@ def test_vehicles_of_a_run_are_heard_over_its_router(tmp_path: Path) -> None:
             assert process.wait(timeout=60) == 0
         finally:
             process.kill()
-            process.wait()
     run.summary.write_text("{}")  # it has ended: nobody is listened to, the store is shown all the same
     told = json.loads(gnd("status", run.root, "--json").stdout)
     assert (told["vehicles"], told["parts"]) == ([], 2)
