@@ -1,7 +1,7 @@
 """The store in a PostgreSQL database that the processes of many machines may open."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -88,12 +88,12 @@ class PostgresStore(SqlStore):
         if not read_only:
             self._enter_boot()
 
-    def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
+    def claim(self, owner: str, n: int, lease_s: float, is_own: inbox.IsOwn | None = None) -> list[Claim]:
         """See `Store.claim`. Where the database's clock has gone back, all that waits by it is free first."""
         if self._database_clock.stepped_back():
             _LOG.warning("%s: the clock of the database has gone back: what waits by it is free", self.location)
             self._writer.run(lambda c: inbox.forget_times(c, self._steady_ns()))
-        return super().claim(owner, n, lease_s, prefer)
+        return super().claim(owner, n, lease_s, is_own)
 
     def backup(self, path: str | Path) -> None:
         """A database is backed up with its own tools.

@@ -24,7 +24,6 @@ from gnd.tile_store.values import NS_PER_S
 
 psycopg = pytest.importorskip("psycopg", reason="pip install 'gnd-fleet[postgres]'")
 from gnd.tile_store.postgres_connection import SQL, DatabaseClock, _require_new_enough, connect  # noqa: E402
-from gnd.tile_store.postgres_connection import SQL, DatabaseClock, _require_new_enough  # noqa: E402
 from gnd.tile_store.postgres_connection import shown as shown_conninfo  # noqa: E402
 from gnd.tile_store.postgres_store import PostgresStore  # noqa: E402
 from gnd.tile_store.postgres_wire import PostgresWire  # noqa: E402
