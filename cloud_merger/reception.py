@@ -25,7 +25,7 @@ from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
 from gnd.schemas.upload_peek import peek_upload
-from gnd.tile_store.errors import DistrictElsewhere
+from gnd.tile_store.errors import DistrictElsewhere, StoreError
 
 MAX_DECLARED: Final = 4096
 MAX_TOKENS: Final = 4096
@@ -156,7 +156,10 @@ class Reception:
             return
         _LOG.info("%s: %s has %s", self._members.own, member, "joined" if alive else "gone")
         if not alive:
-            self._on_death(member)
+            try:
+                self._on_death(member)
+            except StoreError as error:  # it has moved, or is away: leases end by themselves
+                _LOG.warning("%s: what %s had begun stays its own for now: %s", self._members.own, member, error)
         self._give_up_foreign()
 
 

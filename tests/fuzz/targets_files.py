@@ -20,6 +20,7 @@ from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.map_parameters import text_of, with_text
 from gnd.deploy.fleet_config import load_fleet_config
 from gnd.deploy.lab.groups import parse_groups
+from gnd.deploy.status.thresholds import load_thresholds
 from gnd.fleet_bus.config import check_endpoint
 from gnd.fleet_bus.ledger import Ledger
 from gnd.fleet_bus.ledger_file import read_ledger
@@ -353,6 +354,9 @@ TARGETS = (
     FuzzTarget("fleet-settings", ("deploy/fleet_config.py:load_fleet_config",), "settings of a fleet (TOML)",
                _toml(lambda path: load_fleet_config(path, {}, (), {})),
                lambda: [(ROOT / "deploy" / "fleet.toml").read_bytes()], text_mutated, rounds=40),
+    FuzzTarget("alert-thresholds", ("deploy/status/thresholds.py:load_thresholds",), "thresholds of alerts (TOML)",
+               _toml(load_thresholds), lambda: [(ROOT / "deploy" / "monitoring" / "alerts.toml").read_bytes()],
+               text_mutated),
     FuzzTarget("changes-of-settings", (), "NAME=VALUE of --set",
                _text(lambda text: load_agent(None, (text,), {"vehicle": "car-1", "drive": "a.mcap"}, {})),
                lambda: [b"report.longest_s=30", b'live.connect=["tcp/a:1"]', b"detect.mode=paper", _LAYER],

@@ -16,6 +16,7 @@ PROGRAM = textwrap.dedent(
     from gnd.vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
     from gnd.vehicle_agent.features.poles import kernels as poles, place_kernels as places
     from gnd.gnd_map.codec import kernels as coders, voxel_kernels
+    INNER = {"cholesky", "newton_step", "principal"}  # kernels alone call them: they are compiled as parts of these
     USED = (coders.code_bit, coders.code_bits, coders.code_flags, coders.code_plain, voxel_kernels.code_voxels)
     before = len(kernel.cast_rays.signatures)
     warm_up()
@@ -25,7 +26,7 @@ PROGRAM = textwrap.dedent(
     cold = [
         f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles, fit_kernel)
         for k, v in vars(m).items()
-        if hasattr(v, "signatures") and not k.startswith("_") and len(v.signatures) != 1
+        if hasattr(v, "signatures") and not k.startswith("_") and k not in INNER and len(v.signatures) != 1
     ]
     print(json.dumps({
         "cold": cold, "coders": [k.__name__ for k in USED if len(k.signatures) != 1],
