@@ -3,8 +3,11 @@
 import gzip
 import json
 import os
+import shlex
 import shutil
 import statistics
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -56,6 +59,7 @@ class PageOptions:
     most: int = option(1_000_000, "Gaussians of the largest map; 0: none.", span=(0, 2_000_000))
     tiles: int = option(100_000, "Tiles of the city; 0: no city.", span=(0, 1_000_000))
     updates: int = option(40, "Versions published while the page looks on.", span=(1, 10_000))
+    fleet: str = option("", "Arguments of a `gnd fleet` that is watched from its start; empty: none is.")
     seconds: float = option(5.0, "So long frames are counted.", span=(0.5, 600))
 
     def __post_init__(self) -> None:
@@ -71,6 +75,8 @@ def run(options: PageOptions | None = None) -> list[Figure]:
     with tempfile.TemporaryDirectory() as name, _browser() as browser:
         folder = Path(name)
         found = [_size(), *_street(browser, folder, options)]
+        if options.fleet:
+            found += _fleet(browser, folder, options.fleet)
         for n in (options.crowd, options.most):
             found += _crowd(browser, folder, n, options.seconds) if n else []
         return [*found, *_city(browser, folder, options)] if options.tiles else found
@@ -166,6 +172,47 @@ def _frames(tab: Any, shown: int, seconds: float) -> list[Figure]:
         _rate(tab, f"frames, {shown} Gaussians, {name}", reach, seconds)
         for name, reach in (("all as ellipsoids", ELLIPSOIDS), ("as the page draws them", AS_DRAWN))
     ]
+
+
+def _fleet(browser: Any, folder: Path, arguments: str) -> list[Figure]:
+    """From the line in which a fleet that has just started tells the page's address to the first picture of it."""
+    command = [sys.executable, "-m", "gnd.deploy.cli", "fleet", *shlex.split(arguments), "--out", str(folder / "run")]
+    tab, _ = _window(browser)  # that nothing listens yet is no complaint
+    with subprocess.Popen(  # noqa: S603  (a program of ours)
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        try:
+            url = next((line.split()[2] for line in process.stderr if line.startswith("live map: ")), "")
+            begin_s = time.monotonic()
+            if not url:
+                raise BrowserError("the fleet has ended without a page")
+            threading.Thread(target=process.stderr.read, daemon=True).start()  # nobody waits on a full pipe
+            _open_patiently(tab, url)
+            _until(tab, "gndPage.firstPicture_ms > 0")
+            picture_s = time.monotonic() - begin_s
+            shown = int(tab.evaluate("gndPage.state.gaussians"))
+        finally:
+            process.terminate()
+    tab.close()
+    return [
+        Figure("first picture of a fleet after it has told the page's address", picture_s, "s", f"{shown} Gaussians")
+    ]
+
+
+def _open_patiently(tab: Any, url: str) -> None:
+    """Open a page whose server is just starting."""
+    from playwright.sync_api import Error  # for developers alone
+
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            tab.goto(url)
+            return
+        except Error as error:
+            if time.monotonic() > deadline_s:
+                raise BrowserError(f"nothing listens at {url} within {_PATIENCE_S:.0f} s") from error
+            time.sleep(0.02)
 
 
 def _rate(tab: Any, name: str, reach: str, seconds: float) -> Figure:
