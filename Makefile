@@ -26,7 +26,7 @@ fleet: setup     ## run the fleet: make fleet ARGS="--agents 4 --link 3g"
 	$(BIN)/gnd fleet $(ARGS)
 
 test: setup      ## run every test; a few that fail side by side run once more, alone
-	$(BIN)/pytest $(SIDE_BY_SIDE) $(ARGS) || $(BIN)/python tests/suite_again.py $$? $(ARGS)
+	$(BIN)/pytest $(SIDE_BY_SIDE) --cache-clear $(ARGS) || $(BIN)/python tests/suite_again.py $$? $(ARGS)
 
 quick: setup     ## run the tests that take less than five seconds each
 	$(BIN)/pytest $(SIDE_BY_SIDE) -m "not slow" $(ARGS)

@@ -199,7 +199,7 @@ class _Vehicles:
         asked = {"settings": plain_settings(replace(agent, work_dir=work)), "out": str(work / "measured.json")}
         (work / "asked.json").write_text(json.dumps(asked), encoding="utf-8")
         kernels = {"NUMBA_CACHE_DIR": str(work / "kernels")} if compile_all else {}
-        _run_process(work, {**os.environ, "OPENBLAS_NUM_THREADS": "1", **kernels}, self.folder.logs / f"{name}.log")
+        _run_process(work, {**os.environ, **kernels}, self.folder.logs / f"{name}.log")
         self.progress.remove_task(task)
         told = json.loads((work / "measured.json").read_text(encoding="utf-8"))
         if compile_all:

@@ -2,7 +2,7 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import wraps
 from typing import Any, Final
 
@@ -35,19 +35,15 @@ class Stopwatch:
             raise DeployError(f"{owner.__name__} has no method {method} to time")
 
         @wraps(plain)
-        def timed(*arguments: Any, **named: Any) -> Any:
+        def watched(*arguments: Any, **named: Any) -> Any:
             self._enter(stage)
             try:
                 given = plain(*arguments, **named)
             finally:
                 self._leave()
-            return self._asked(given, stage) if isinstance(given, Iterator) else given
+            return self.timed(given, stage) if isinstance(given, Iterator) else given
 
-        setattr(owner, method, timed)
-
-    def timed(self, items: Iterator[Any], stage: str) -> Iterator[Any]:
-        """The same items; the time to get each counts for a stage."""
-        return self._asked(items, stage)
+        setattr(owner, method, watched)
 
     def lap(self) -> None:
         """A scan is done with: what was measured since the last counts for it."""
@@ -55,7 +51,8 @@ class Stopwatch:
         self.scans.append(dict(self._now))
         self._now.clear()
 
-    def _asked(self, items: Iterator[Any], stage: str) -> Iterator[Any]:
+    def timed(self, items: Iterator[Any], stage: str) -> Iterator[Any]:
+        """The same items; the time to get each counts for a stage."""
         while True:
             self._enter(stage)
             try:
@@ -81,10 +78,3 @@ class Stopwatch:
 
 
 _END: Final = object()
-Watched = tuple[type, str, str]
-
-
-def watch_all(stopwatch: Stopwatch, parts: Callable[[], tuple[Watched, ...]]) -> None:
-    """Time every (class, method, stage)."""
-    for owner, method, stage in parts():
-        stopwatch.watch(owner, method, stage)

@@ -15,13 +15,13 @@ from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
 if TYPE_CHECKING:
-    from gnd.deploy.bench.stopwatch import Stopwatch, Watched
+    from gnd.deploy.bench.stopwatch import Stopwatch
     from gnd.vehicle_agent.vehicle import AgentVehicle
 
 READING = "reading the recording"
 
 
-def parts() -> "tuple[Watched, ...]":
+def parts() -> tuple[tuple[type, str, str], ...]:
     """What is timed: (class, method, stage)."""
     from gnd.gnd_map.accumulate import VoxelAccumulator
     from gnd.vehicle_agent.detect.detector import ChangeDetector
@@ -68,7 +68,7 @@ def measured(asked: dict[str, Any]) -> dict[str, Any]:
     """
     start: dict[str, float] = {"interpreter": _BEGUN_CPU_S}
     compiled: list[float] = []
-    from gnd.deploy.bench.stopwatch import Stopwatch, watch_all
+    from gnd.deploy.bench.stopwatch import Stopwatch
     from gnd.vehicle_agent.memory import keep_small
     from gnd.vehicle_agent.settings import agent_of
     from gnd.vehicle_agent.vehicle import open_vehicle
@@ -76,7 +76,8 @@ def measured(asked: dict[str, Any]) -> dict[str, Any]:
     keep_small()
     _record_compiling(compiled)
     stopwatch = Stopwatch()
-    watch_all(stopwatch, parts)
+    for owner, method, stage in parts():
+        stopwatch.watch(owner, method, stage)
     config = agent_of(asked["settings"], where="bench")
     start["imports"] = time.process_time()
     with open_vehicle(config, threading.Event()) as vehicle:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import psutil
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.confirmation import ConfirmationParameters
@@ -93,23 +92,9 @@ class ChaosCloud:
         prefix = "shard" if part == "worker" else part
         return sorted(name for name in self.supervisor.pids() if name.split("-")[0] == prefix)
 
-    def pids(self, part: str, name: str) -> list[int]:
-        """The process of a name, or the worker of a shard; empty while it is being started again."""
-        pid = self.supervisor.pids().get(name, 0)
-        if part != "worker":
-            return [pid] if pid and psutil.pid_exists(pid) else []
-        try:
-            return [child.pid for child in psutil.Process(pid).children()]
-        except psutil.Error:
-            return []
-
     def step_clock(self, by_s: float) -> None:
         """Set the cloud's time of day wrong by so much; 0 = right."""
         _write_offset(self.folder / "clock", by_s)
-
-    def retry(self) -> None:
-        """What `gnd map retry` does: tiles that were set aside are merged again."""
-        self.store.take_up_again((one.layer, one.tile) for one in self.store.tiles_set_aside())
 
     def shine(self, number: int) -> None:
         """Publish another version of the beacon; a store that is busy is asked again the next time."""

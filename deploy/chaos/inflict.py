@@ -13,6 +13,7 @@ from typing import Final, Protocol
 
 import apsw
 import numpy as np
+import psutil
 
 from gnd.deploy.chaos import page
 from gnd.deploy.chaos.clients import put
@@ -81,14 +82,24 @@ class HurtCloud(Protocol):
     def names(self, part: str) -> list[str]:
         """The processes of a part, in order; of "worker" the shards whose they are."""
 
-    def pids(self, part: str, name: str) -> list[int]:
-        """The process of a name, or the worker of a shard; empty while it is being started again."""
-
     def step_clock(self, by_s: float) -> None:
         """Set the time of day wrong by so much; 0 = right."""
 
-    def retry(self) -> None:
-        """Merge tiles again that were set aside."""
+
+def pids_of(supervisor: Supervisor, part: str, name: str) -> list[int]:
+    """The process of a name, or the worker of a shard; empty while it is being started again."""
+    pid = supervisor.pids().get(name, 0)
+    if part != "worker":
+        return [pid] if pid and psutil.pid_exists(pid) else []
+    try:
+        return [child.pid for child in psutil.Process(pid).children()]
+    except psutil.Error:
+        return []
+
+
+def retry(store: SqlStore) -> None:
+    """What `gnd map retry` does: tiles that were set aside are merged again."""
+    store.take_up_again((one.layer, one.tile) for one in store.tiles_set_aside())
 
 
 class Inflictor:
@@ -122,9 +133,9 @@ class Inflictor:
             return self._send(fault)
         names = self._cloud.names(kind.part)
         name = names[int(fault.draw * len(names))]
-        pids = self._cloud.pids(kind.part, name)
+        pids = pids_of(self._cloud.supervisor, kind.part, name)
         if kind.group == "disk":
-            pids += self._cloud.pids("worker", name) if kind.part == "shard" else []
+            pids += pids_of(self._cloud.supervisor, "worker", name) if kind.part == "shard" else []
             return name, self._fill(pids, fault)
         if kind.group == "kill":
             self._kill(kind.part, name, pids)
@@ -169,14 +180,14 @@ class Inflictor:
         was = {at: page.write(self._cloud.path, at, b"\xff" * page.SAMPLE_BYTES) for at in found}
         names = rng.sample(self._cloud.names("worker"), 1) if part else []
         for name in names:
-            self._kill(part, name, self._cloud.pids(part, name))
+            self._kill(part, name, pids_of(self._cloud.supervisor, part, name))
 
         def end() -> None:
             for at, before in was.items():
                 page.write(self._cloud.path, at, before)
             self._damaged -= set(was)
             with suppress(StoreError):
-                self._cloud.retry()
+                retry(self._cloud.store)
 
         return ", ".join([*found.values(), *(f"worker of {name} killed" for name in names)]), end
 

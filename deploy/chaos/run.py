@@ -13,7 +13,7 @@ from gnd.deploy.chaos.checks import Findings, look
 from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
 from gnd.deploy.chaos.cloud import ChaosCloud, running
 from gnd.deploy.chaos.faults import Fault
-from gnd.deploy.chaos.inflict import MESSENGER, End, Inflictor
+from gnd.deploy.chaos.inflict import MESSENGER, End, Inflictor, retry
 from gnd.deploy.chaos.service import SERVICES, Gaps, gaps, watched
 from gnd.deploy.chaos.street import read_street
 from gnd.deploy.errors import ChaosError
@@ -215,7 +215,7 @@ def _settle(cloud: ChaosCloud, inflictor: Inflictor, within_s: float) -> float |
                 return time.monotonic() - begin_s
             if time.monotonic() - retried_s > RETRY_S:
                 retried_s = time.monotonic()
-                cloud.retry()
+                retry(cloud.store)
     return None
 
 

@@ -10,15 +10,21 @@ MOST_SWEEPS = 30  # of larger ones, which stop when they are diagonal: after six
 LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
 
+@inlined
+def _rotation(S: F64, p: int, q: int) -> tuple[float, float, float]:
+    """Tangent, cosine and sine of the turn of the symmetric S (n, n) after which S[p, q], not 0 now, is 0."""
+    theta = 0.5 * (S[q, q] - S[p, p]) / S[p, q]
+    t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
+    c = 1.0 / np.sqrt(t * t + 1.0)
+    return t, c, t * c
+
+
 @kernel
 def _jacobi_rotate(S: F64, V: F64, p: int, q: int) -> None:
     """Turn the symmetric S (3, 3) so that S[p, q] becomes 0, and the columns of V with it."""
     if S[p, q] == 0.0:
         return
-    theta = 0.5 * (S[q, q] - S[p, p]) / S[p, q]
-    t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-    c = 1.0 / np.sqrt(t * t + 1.0)
-    s = t * c
+    t, c, s = _rotation(S, p, q)
     o = 3 - p - q
     S[p, p], S[q, q] = S[p, p] - t * S[p, q], S[q, q] + t * S[p, q]
     S[p, q] = S[q, p] = 0.0
@@ -274,10 +280,7 @@ def _rotate(S: F64, V: F64, p: int, q: int) -> None:
     """Turn the symmetric S (n, n) so that S[p, q] becomes 0, and the columns of V with it."""
     if S[p, q] == 0.0:
         return
-    theta = 0.5 * (S[q, q] - S[p, p]) / S[p, q]
-    t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-    c = 1.0 / np.sqrt(t * t + 1.0)
-    s = t * c
+    _, c, s = _rotation(S, p, q)
     for r in range(S.shape[0]):
         S[r, p], S[r, q] = c * S[r, p] - s * S[r, q], s * S[r, p] + c * S[r, q]
         V[r, p], V[r, q] = c * V[r, p] - s * V[r, q], s * V[r, p] + c * V[r, q]

@@ -228,10 +228,10 @@ def marginalised(
 
 def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParameters, scale: float) -> None:
     """Match the knots with the map that have moved since, or were matched with another scale."""
-    matched = [knot for knot in knots if knot.match is not None]
-    moved = dict(zip(map(id, matched), _moved(matched), strict=True))
+    moved = iter(_moved([knot for knot in knots if knot.match is not None]))
     for knot in knots:
-        if knot.match is not None and knot.match.scale == scale and _small(moved[id(knot)][None], SMALL_M, SMALL_RAD):
+        stays = knot.match is not None and _small(next(moved)[None], SMALL_M, SMALL_RAD)
+        if knot.match is not None and stays and knot.match.scale == scale:
             continue
         knot.match = linearised(knot.points_m, knot.T_map_vehicle, match_map, par, scale, knot.wheels_m)
 

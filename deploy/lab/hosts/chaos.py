@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import psutil
-
 from gnd.deploy.chaos.faults import BY_NAME, plan
 from gnd.deploy.chaos.inflict import MESSENGER, Inflictor
 from gnd.deploy.chaos.run import Timeline
@@ -119,16 +117,6 @@ class LabVictim:
         found += [name for name in self.supervisor.pids() if part == "router" and name == HUB]
         return sorted(found)
 
-    def pids(self, part: str, name: str) -> list[int]:
-        """See `HurtCloud.pids`."""
-        pid = self.supervisor.pids().get(name, 0)
-        if part != "worker":
-            return [pid] if pid and psutil.pid_exists(pid) else []
-        try:
-            return [child.pid for child in psutil.Process(pid).children()]
-        except psutil.Error:
-            return []
-
     def step_clock(self, by_s: float) -> None:
         """Nothing: clocks of hosts have faults of their own.
 
@@ -136,10 +124,6 @@ class LabVictim:
             LabError: always.
         """
         raise LabError(f"the clock of a laboratory is not set by chaos ({by_s:+g} s)")
-
-    def retry(self) -> None:
-        """See `HurtCloud.retry`."""
-        self.store.take_up_again((one.layer, one.tile) for one in self.store.tiles_set_aside())
 
 
 @dataclass(slots=True)

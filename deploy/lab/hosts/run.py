@@ -9,6 +9,7 @@ from typing import Final
 
 from gnd.deploy.chaos.checks import Findings, compare_reports, find_stuck, read_outbox, verified
 from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
+from gnd.deploy.chaos.inflict import retry
 from gnd.deploy.chaos.run import HURRIED_S, RETRY_S
 from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.errors import LabError
@@ -260,7 +261,7 @@ def _settle(cloud: HostsCloud, store: SqlStore, within_s: float, chaos: LabChaos
                 return time.monotonic() - begin_s
             if chaos and time.monotonic() - retried_s > RETRY_S:
                 retried_s = time.monotonic()
-                chaos.victim.retry()
+                retry(store)
     return None
 
 
