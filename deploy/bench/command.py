@@ -9,6 +9,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd.answers import json_option
 from gnd.deploy.errors import NoStudies
 from gnd.deploy.run_folder import create_run_folder
 from gnd.ending import ending_at_once, orderly
@@ -34,7 +35,7 @@ def bench() -> None:
 )
 @click.option("--flame", type=_PATH, help="Write a flame graph of the last drive here (speedscope; needs py-spy).")
 @click.option("--out", type=_PATH, default=_DEFAULT, show_default=True, help="Folder of the run, replaced if need be.")
-@click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
+@json_option
 def agent(
     drive: Path | None,
     base_map: Path | None,
