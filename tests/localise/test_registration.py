@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import registration_twin
 import small_gicp
+from registration_twin import _principal, _solve
 from yard import (
     GROUND_M,
     corridor,
@@ -30,7 +32,7 @@ from gnd.vehicle_agent.localise.kernels import (
 )
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import ON_MAP, RegistrationParameters
-from gnd.vehicle_agent.localise.registration import WHEELS_M, _principal, _solve, register
+from gnd.vehicle_agent.localise.registration import WHEELS_M, linearised, register
 
 UNIFORM = 1.0 / 12.0
 
@@ -110,6 +112,47 @@ def test_kernel_equals_its_plain_twin(scene, rng, scale):
     np.testing.assert_allclose(g, g_plain, rtol=1e-9, atol=1e-9 * np.abs(g_plain).max())
     np.testing.assert_allclose(sums, sums_plain, rtol=1e-12)
     assert sums_plain[1] > 100
+
+
+def corridor_scene(rng):
+    points = corridor(rng)
+    T = pose(3.0, 0.7, 2.0)
+    return match_map_of(local_map_of(points)), T, seen_from(rng, points, T, 3000)
+
+
+@pytest.mark.parametrize("start", ["near", "wide", "capture"])
+@pytest.mark.parametrize("where", ["yard", "corridor"])
+def test_a_registration_equals_its_plain_twin(scene, rng, where, start):
+    """All numbers of the result, in a corridor also which direction nothing constrains and that it is not moved."""
+    m, T, points = scene if where == "yard" else corridor_scene(rng)
+    for _ in range(5):
+        begin = moved(rng, T, *{"near": (0.1, 0.3), "wide": (0.5, 1.5), "capture": (1.0, 3.0)}[start])
+        found, plain = (module(points, begin, m, None, start) for module in (register, registration_twin.register))
+        assert (found.iterations, found.converged) == (plain.iterations, plain.converged)
+        assert found.matching_ratio == plain.matching_ratio
+        assert found.known_ratio == plain.known_ratio
+        assert found.fit == pytest.approx(plain.fit, abs=1e-10)
+        np.testing.assert_allclose(found.T_map_vehicle, plain.T_map_vehicle, atol=1e-9)
+        np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-6, atol=1e-12)
+        weak, weak_plain = (one.degenerate.T @ one.degenerate for one in (found, plain))
+        np.testing.assert_allclose(weak, weak_plain, atol=1e-6)
+        assert len(found.degenerate) == (1 if where == "corridor" else 0)
+
+
+@pytest.mark.parametrize("where", ["yard", "corridor"])
+def test_normal_equations_of_a_pose_equal_their_plain_twin(scene, rng, where):
+    m, T, points = scene if where == "yard" else corridor_scene(rng)
+    for scale in (2.0, 8.0):
+        at = moved(rng, T, 0.1, 0.5)
+        found, plain = (
+            module(points, at, m, RegistrationParameters(), scale)
+            for module in (linearised, registration_twin.linearised)
+        )
+        assert (found.matched, found.inside) == (plain.matched, plain.inside)
+        assert found.cost == pytest.approx(plain.cost, rel=1e-12)
+        np.testing.assert_allclose(found.H, plain.H, atol=1e-9 * np.abs(plain.H).max())
+        np.testing.assert_allclose(found.g, plain.g, atol=1e-9 * np.abs(plain.g).max())
+        np.testing.assert_allclose(found.constrained, plain.constrained, atol=1e-6)
 
 
 def spectrum(rng, values):

@@ -5,6 +5,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+import stretch_twin
 from yard import corridor, local_map_of, pose, seen_from
 
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
@@ -106,6 +107,28 @@ def test_odometry_alone_is_what_gtsam_says(nothing):
     off = np.array([log_se3(T_inverse(T) @ knot.T_map_vehicle) for T, knot in zip(expected, knots, strict=True)])
     assert np.abs(off[:, 3:]).max() < 2e-3
     assert np.abs(off[:, :3]).max() < 2e-4
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_the_solution_equals_that_of_its_plain_twin(yard, nothing, yard_points, mapped):
+    """Poses, shared parameters, information, and the matches that are left, also where some were matched before."""
+    shared, points, m = np.array([1e-3, 4e-3, 2e-3, 0.0]), yard_points[::7] if mapped else None, yard
+    (_, knots, steps), (_, plain, _) = (problem(np.random.default_rng(6), 9, 1.0, shared, points) for _ in range(2))
+    m = yard if mapped else nothing
+    belief = belief_at(through(0))
+    for scales in ((8.0, 4.0), SCALES):  # the second begins with the matches of the first
+        found = solve_stretch(knots, steps, belief, m, PAR, scales)
+        shared_plain, A = stretch_twin.solve(plain, steps, belief, m, PAR, scales)
+        np.testing.assert_allclose(found.shared, shared_plain, atol=1e-9)
+        np.testing.assert_allclose(
+            found.shared_covariance, np.linalg.inv(A)[-N_SHARED:, -N_SHARED:], rtol=1e-5, atol=1e-12
+        )
+        for one, other in zip(knots, plain, strict=True):
+            np.testing.assert_allclose(one.T_map_vehicle, other.T_map_vehicle, atol=1e-9)
+            np.testing.assert_allclose(one.match.H, other.match.H, rtol=1e-6, atol=1e-6 * max(1.0, other.match.H.max()))
+            assert (one.match.matched, one.match.inside, one.match.scale) == (
+                other.match.matched, other.match.inside, other.match.scale,
+            )  # fmt: skip
 
 
 def test_what_left_the_stretch_counts_once(yard, yard_points):

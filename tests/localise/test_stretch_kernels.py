@@ -8,7 +8,15 @@ from yard import pose
 
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
 from gnd.vehicle_agent.localise.stretch import STEP_CHI2, StretchStep, log_se3
-from gnd.vehicle_agent.localise.stretch_kernels import SHARED, add_matches, add_steps, motions, residuals, solve
+from gnd.vehicle_agent.localise.stretch_kernels import (
+    SHARED,
+    add_matches,
+    add_steps,
+    eliminate,
+    motions,
+    residuals,
+    solve,
+)
 
 N = 7
 
@@ -139,3 +147,13 @@ def test_what_is_not_positive_definite_is_told(stretch, rng):
     assert not solve(A, g, np.empty_like(A), np.empty_like(g))
     A[9, 9] = np.nan
     assert not solve(A, g, np.empty_like(A), np.empty_like(g))
+
+
+def test_what_is_not_positive_definite_is_eliminated_with_pivots_and_what_is_singular_refused(rng):
+    half = rng.normal(size=(20, 20))
+    A, g, x = half + half.T, rng.normal(size=20), np.empty(20)
+    A[0, 0] = 0.0
+    assert not solve(A, g, np.empty_like(A), x)
+    assert eliminate(A.copy(), g.copy(), x)
+    np.testing.assert_allclose(x, np.linalg.solve(A, g), rtol=1e-8)
+    assert not eliminate(np.zeros((3, 3)), np.ones(3), np.empty(3))

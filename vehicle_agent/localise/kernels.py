@@ -308,7 +308,7 @@ def principal(S: F64, V: F64) -> None:
 
 
 @kernel
-def _by_levers(H: F64, S: F64) -> None:
+def by_levers(H: F64, S: F64) -> None:
     """Fill S (6, 6) with H, turns measured as motion at `LEVER_M`."""
     for r in range(6):
         for c in range(6):
@@ -334,7 +334,7 @@ def newton_step(H: F64, g: F64, least: float, step: F64) -> None:
     `least` (solution remapping, Zhang et al. 2016). `registration._solve` is the plain twin.
     """
     S, L, V = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6))
-    _by_levers(H, S)
+    by_levers(H, S)
     for r in range(6):
         step[r] = -g[r] / (LEVER_M if r < 3 else 1.0)
     if cholesky(S, least, L) and cholesky(S, 0.0, L):  # nearly always: all directions count
@@ -427,7 +427,7 @@ def without_hints(H: F64, share: float, constrained: F64) -> bool:
     `LEVER_M`, has less than `share` of the strongest; False where it takes nothing.
     """
     S, V = np.empty((6, 6)), np.empty((6, 6))
-    _by_levers(H, S)
+    by_levers(H, S)
     principal(S, V)
     horizontal = V[3] ** 2 + V[4] ** 2 > 0.5
     strongest = 0.0

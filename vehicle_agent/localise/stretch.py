@@ -16,14 +16,28 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64, I32
-from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.gnd_map.arrays import F64, I32, I64
+from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.localise.influence import SeenScan, influence
 from gnd.vehicle_agent.localise.kernels import LEVER_M
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.localise.registration import WHEELS_M, Linearised, linearised
-from gnd.vehicle_agent.localise.stretch_kernels import SHARED, add_matches, add_steps, motions, residuals, solve
+from gnd.vehicle_agent.localise.registration import (
+    DEGENERATE_SHARE,
+    REGISTRATION_GATE_PER_SCALE,
+    WHEEL_SCALE,
+    WHEELS_M,
+    Linearised,
+    wheel_weight,
+)
+from gnd.vehicle_agent.localise.stretch_kernels import (
+    SHARED,
+    add_matches,
+    add_steps,
+    motions,
+    residuals,
+    settle_stretch,
+)
 
 N_SHARED: Final = SHARED
 """What all steps share: gyro bias [rad/s], wheel scale [1], motion to the left and upwards per metre forward [1]."""
@@ -119,10 +133,66 @@ class _System(NamedTuple):
     A: F64
     g: F64
 
-    def solution(self) -> F64:
-        """A^-1 g (n,)."""
-        L, x = np.empty_like(self.A), np.empty_like(self.g)
-        return x if solve(self.A, self.g, L, x) else np.linalg.solve(self.A, self.g).astype(np.float64)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Held:
+    """N knots side by side, as kernels take them.
+
+    Attributes:
+        points_m, ends: (P, 3) of all scans, those of scan k up to ends[k]; (N,) int64.
+        wheels_m: (N, W, 3).
+        T, weight: (N, 4, 4) present poses, and (N,).
+        T_match, scale: (N, 4, 4) and (N,), where and how each was matched; scale 0: it was not.
+        H, g, constrained, cost, matched, inside: of each match, see `Linearised`.
+    """
+
+    points_m: F64
+    ends: I64
+    wheels_m: F64
+    T: F64
+    weight: F64
+    T_match: F64
+    scale: F64
+    H: F64
+    g: F64
+    constrained: F64
+    cost: F64
+    matched: I64
+    inside: I64
+
+    @classmethod
+    def of(cls, knots: Sequence[Knot]) -> "_Held":
+        """From knots with or without a match."""
+        n = len(knots)
+        held = cls(
+            np.concatenate([knot.points_m for knot in knots]),
+            np.cumsum([len(knot.points_m) for knot in knots]),
+            np.array([knot.wheels_m for knot in knots]),
+            _poses(knots),
+            np.array([knot.weight for knot in knots]),
+            np.zeros((n, 4, 4)), np.zeros(n), np.empty((n, 6, 6)), np.empty((n, 6)), np.empty((n, 6, 6)), np.empty(n),
+            np.empty(n, np.int64), np.empty(n, np.int64),
+        )  # fmt: skip
+        for k, knot in enumerate(knots):
+            if (match := knot.match) is not None:
+                held.T_match[k], held.scale[k], held.H[k], held.g[k] = (
+                    match.T_map_vehicle,
+                    match.scale,
+                    match.H,
+                    match.g,
+                )
+                held.constrained[k], held.cost[k] = match.constrained, match.cost
+                held.matched[k], held.inside[k] = match.matched, match.inside
+        return held
+
+    def give_back(self, knots: Sequence[Knot]) -> None:
+        """Poses and matches to the knots that they are of."""
+        for k, knot in enumerate(knots):
+            knot.T_map_vehicle = self.T[k]
+            knot.match = Linearised(
+                self.T_match[k], float(self.scale[k]), self.H[k], self.g[k], float(self.cost[k]), int(self.matched[k]),
+                int(self.inside[k]), self.constrained[k],
+            )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,17 +260,21 @@ def solve_stretch(
         scales: robust scales in sigmas, wide to narrow.
         max_iterations: Gauss-Newton steps at each scale.
     """
-    shared, measured = belief.shared.copy(), _Steps.of(steps)
-    for scale in scales:
-        for _ in range(max_iterations):
-            _match(knots, match_map, registration, scale)
-            step = -_system(knots, measured, belief, shared, registration).solution()
-            _move(knots, step)
-            shared += step[-N_SHARED:]
-            if _small(step[:-N_SHARED].reshape(-1, 6), STOP_M, STOP_RAD):
-                break
-    _match(knots, match_map, registration, scales[-1])
-    covariance = np.asarray(np.linalg.inv(_system(knots, measured, belief, shared, registration).A), np.float64)
+    measured, held = _Steps.of(steps), _Held.of(knots)
+    n, shared = 6 * len(knots) + N_SHARED, belief.shared.copy()
+    system = _System(np.empty((n, n)), np.empty(n))
+    m, par = match_map, registration
+    if not settle_stretch(
+        held.points_m, held.ends, held.wheels_m, held.T, held.weight / par.rules.correlation, m.index, m.A, m.b,
+        m.mean_m, m.information, np.array(scales, np.float64), WHEEL_SCALE, REGISTRATION_GATE_PER_SCALE,
+        wheel_weight(par), DEGENERATE_SHARE, SMALL_M, SMALL_RAD, held.T_match, held.scale, held.H, held.g,
+        held.constrained, held.cost, held.matched, held.inside, measured.first, measured.T_before_now,
+        measured.information, measured.shared, STEP_CHI2, *belief, shared, max_iterations, STOP_M,
+        STOP_RAD, *system,
+    ):  # fmt: skip
+        raise np.linalg.LinAlgError(f"the normal equations of {len(knots)} scans and {len(steps)} steps are singular")
+    held.give_back(knots)
+    covariance = np.asarray(np.linalg.inv(system.A), np.float64)
     seen = _as_seen(knots, belief, covariance, match_map, registration)
     return _solved(knots, measured, covariance, shared - belief.shared, belief.shared, registration, scales[-1], *seen)
 
@@ -224,16 +298,6 @@ def marginalised(
     information = A[kept, kept] - A[kept, gone] @ through[:, :-1]
     gradient = g[kept] - A[kept, gone] @ through[:, -1]
     return StretchBelief(last.T_map_vehicle, shared.copy(), 0.5 * (information + information.T), gradient)
-
-
-def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParameters, scale: float) -> None:
-    """Match the knots with the map that have moved since, or were matched with another scale."""
-    moved = iter(_moved([knot for knot in knots if knot.match is not None]))
-    for knot in knots:
-        stays = knot.match is not None and _small(next(moved)[None], SMALL_M, SMALL_RAD)
-        if knot.match is not None and stays and knot.match.scale == scale:
-            continue
-        knot.match = linearised(knot.points_m, knot.T_map_vehicle, match_map, par, scale, knot.wheels_m)
 
 
 def _moved(matched: Sequence[Knot]) -> F64:
@@ -284,13 +348,6 @@ def _add_belief(A: F64, g: F64, first: Knot, belief: StretchBelief, shared: F64)
 def residual(relative: F64, step: StretchStep, shared_off: F64) -> F64:
     """Residual e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,) of a step."""
     return log_se3(T_inverse(step.T_before_now) @ relative) - step.shared @ shared_off
-
-
-def _move(knots: Sequence[Knot], step: F64) -> None:
-    for knot, small in zip(knots, step[:-N_SHARED].reshape(-1, 6), strict=True):
-        R, T = knot.T_map_vehicle[:3, :3], knot.T_map_vehicle.copy()
-        T[:3, :3], T[:3, 3] = R @ exp_so3(small[:3]), T[:3, 3] + R @ small[3:]
-        knot.T_map_vehicle = T
 
 
 def _solved(
@@ -386,11 +443,6 @@ def shared_of(T_driven: F64, dt_s: float) -> F64:
     S[3:, SCALE] = turned @ T_driven[:3, 3]
     S[3:, LEFT], S[3:, UP] = turned @ [0.0, forward_m, 0.0], turned @ [0.0, 0.0, forward_m]
     return S
-
-
-def _small(motion: F64, m: float, rad: float) -> bool:
-    """True when none of the small motions (N, 6) is larger."""
-    return bool(np.abs(motion[:, 3:]).max(initial=0.0) < m and np.abs(motion[:, :3]).max(initial=0.0) < rad)
 
 
 def log_se3(T: F64) -> F64:

@@ -6,8 +6,9 @@ twins are in `tests/localise/test_stretch_kernels.py`.
 
 import numpy as np
 
-from gnd.gnd_map.arrays import F64, I32
+from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.jit import kernel
+from gnd.vehicle_agent.localise.register_kernels import linearise_pose
 
 SHARED = 4
 
@@ -159,4 +160,166 @@ def solve(A: F64, g: F64, L: F64, x: F64) -> bool:
         x[r] /= L[r, r]
         for c in range(max(0, 6 * (r // 6) - 6) if r < poses else 0, r):
             x[c] -= L[r, c] * x[r]
+    return True
+
+
+@kernel
+def eliminate(A: F64, g: F64, x: F64) -> bool:
+    """Fill x (n,) with A^-1 g by Gaussian elimination with pivots, for a symmetric A (n, n) that is not positive
+    definite; A and g are used up. False where it is singular.
+    """
+    n = g.shape[0]
+    for c in range(n):
+        best = c + int(np.argmax(np.abs(A[c:, c])))
+        if A[best, c] == 0.0:
+            return False
+        for k in range(c, n):
+            A[c, k], A[best, k] = A[best, k], A[c, k]
+        g[c], g[best] = g[best], g[c]
+        for r in range(c + 1, n):
+            factor = A[r, c] / A[c, c]
+            if factor != 0.0:
+                for k in range(c, n):
+                    A[r, k] -= factor * A[c, k]
+                g[r] -= factor * g[c]
+    for r in range(n - 1, -1, -1):
+        x[r] = g[r]
+        for k in range(r + 1, n):
+            x[r] -= A[r, k] * x[k]
+        x[r] /= A[r, r]
+    return True
+
+
+@kernel
+def match_moved(
+    points: F64, ends: I64, wheels: F64, T: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale: float,
+    wheel_scale: float, gate: float, wheel_weight: float, share: float, small_m: float, small_rad: float,
+    T_match: F64, scale_match: F64, H: F64, slope: F64, constrained: F64, cost: F64, matched: I64, inside: I64,
+) -> None:  # fmt: skip
+    """Match the scans of N poses T (N, 4, 4) with the map that have moved by more than `small_m` or `small_rad` since
+    they were, or were matched with another scale; the rest stays as it is.
+
+    points (P, 3) are in vehicle frames, those of scan k up to ends[k] (N,); wheels (N, W, 3); what is about the map is
+    as in `linearise_pose`. Kept up to date: T_match (N, 4, 4) and scale_match (N,), where and how each was matched,
+    scale 0 if never, and the matches: H (N, 6, 6), slope (N, 6), constrained (N, 6, 6), cost, matched and inside (N,).
+    """
+    R_off, off = np.empty((3, 3)), np.empty(6)
+    R, t = np.empty((3, 3)), np.empty(3)
+    start = 0
+    for k in range(T.shape[0]):
+        first, start = start, ends[k]
+        if scale_match[k] == scale:
+            motion(T_match[k], T[k], R_off, off)
+            if np.abs(off[3:]).max() < small_m and np.abs(off[:3]).max() < small_rad:
+                continue
+        for r in range(3):
+            t[r] = T[k, r, 3]
+            for c in range(3):
+                R[r, c] = T[k, r, c]
+        cost[k], matched[k], inside[k] = linearise_pose(
+            points[first:start], wheels[k], R, t, index, A, b, mean, omega, scale, wheel_scale, gate, wheel_weight,
+            share, H[k], slope[k], constrained[k],
+        )  # fmt: skip
+        T_match[k], scale_match[k] = T[k], scale
+
+
+@kernel
+def normal_equations(
+    T: F64, weight: F64, T_match: F64, H: F64, slope: F64, first: I32, T_step: F64, information: F64, shared: F64,
+    chi2: float, T_belief: F64, shared_belief: F64, information_belief: F64, gradient_belief: F64, shared_now: F64,
+    A: F64, g: F64,
+) -> None:  # fmt: skip
+    """Fill A (n, n) and g (n,), n = 6 N + `SHARED`, of a stretch of N poses T (N, 4, 4) that all have a match.
+
+    weight (N,) is that of each match, T_match, H and slope are as in `match_moved`, the steps as in `residuals`. What is
+    known of the first pose and of `shared_now` (`SHARED`,): T_belief (4, 4), shared_belief (`SHARED`,), and information
+    (10, 10) and gradient (10,) there.
+    """
+    n, m = g.shape[0], first.shape[0]
+    A[:] = 0.0
+    R_off, off = np.empty((3, 3)), np.empty(6 + SHARED)
+    motion(T_belief, T[0], R_off, off[:6])
+    for r in range(SHARED):
+        off[6 + r] = shared_now[r] - shared_belief[r]
+    g[:] = 0.0
+    for r in range(6 + SHARED):
+        at = r if r < 6 else n - SHARED + r - 6
+        g[at] = gradient_belief[r]
+        for c in range(6 + SHARED):
+            to = c if c < 6 else n - SHARED + c - 6
+            A[at, to] = information_belief[r, c]
+            g[at] += information_belief[r, c] * off[c]
+    moved = np.empty((T.shape[0], 6))
+    motions(T_match, T, moved)
+    add_matches(np.arange(T.shape[0]).astype(np.int32), moved, weight, H, slope, A, g)
+    e, J, robust = np.empty((m, 6)), np.empty((m, 6, 12 + SHARED)), np.empty(m)
+    residuals(T, first, T_step, information, shared, off[6:], chi2, e, J, robust)
+    add_steps(first, information, e, J, robust, A, g)
+
+
+@kernel
+def move(T: F64, step: F64) -> None:
+    """Move poses T (N, 4, 4) by -step (6 N + `SHARED`,): small motions of each vehicle in its own frame."""
+    R, E = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(T.shape[0]):
+        x, y, z = -step[6 * k], -step[6 * k + 1], -step[6 * k + 2]
+        angle = np.sqrt(x * x + y * y + z * z)
+        half_sine = np.sin(0.5 * angle) / angle if angle > 1e-8 else 0.5
+        x, y, z, w = half_sine * x, half_sine * y, half_sine * z, np.cos(0.5 * angle)
+        E[0, 0], E[0, 1], E[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
+        E[1, 0], E[1, 1], E[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+        E[2, 0], E[2, 1], E[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
+        for r in range(3):
+            for c in range(3):
+                R[r, c] = T[k, r, c]
+        for r in range(3):
+            T[k, r, 3] -= R[r, 0] * step[6 * k + 3] + R[r, 1] * step[6 * k + 4] + R[r, 2] * step[6 * k + 5]
+            for c in range(3):
+                T[k, r, c] = R[r, 0] * E[0, c] + R[r, 1] * E[1, c] + R[r, 2] * E[2, c]
+
+
+@kernel
+def settle_stretch(
+    points: F64, ends: I64, wheels: F64, T: F64, weight: F64, index: I32, A_map: F64, b_map: F64, mean: F64,
+    omega: F64, scales: F64, least_wheel_scale: float, gate: float, wheel_weight: float, share: float, small_m: float,
+    small_rad: float, T_match: F64, scale_match: F64, H: F64, slope: F64, constrained: F64, cost: F64, matched: I64,
+    inside: I64, first: I32, T_step: F64, information: F64, shared: F64, chi2: float, T_belief: F64,
+    shared_belief: F64, information_belief: F64, gradient_belief: F64, shared_now: F64, most_steps: int, stop_m: float,
+    stop_rad: float, A: F64, g: F64,
+) -> bool:  # fmt: skip
+    """Move the poses T (N, 4, 4) of a stretch, and `shared_now`, to where map, steps and belief agree best: steps of
+    Gauss-Newton at each of `scales` (S,), at most `most_steps`, until no pose moves by `stop_m` or `stop_rad`.
+
+    The rest is as in `match_moved` and `normal_equations`; A and g are those at the last poses. False where the normal
+    equations are singular.
+    """
+    n = g.shape[0]
+    L, x = np.empty((n, n)), np.empty(n)
+    for stage in range(scales.shape[0] + 1):
+        scale = scales[min(stage, scales.shape[0] - 1)]
+        for _ in range(most_steps):
+            match_moved(
+                points, ends, wheels, T, index, A_map, b_map, mean, omega, scale, max(scale, least_wheel_scale), gate,
+                wheel_weight, share, small_m, small_rad, T_match, scale_match, H, slope, constrained, cost, matched,
+                inside,
+            )  # fmt: skip
+            normal_equations(
+                T, weight, T_match, H, slope, first, T_step, information, shared, chi2, T_belief, shared_belief,
+                information_belief, gradient_belief, shared_now, A, g,
+            )  # fmt: skip
+            if stage == scales.shape[0]:  # once more, at the last poses
+                return True
+            if not solve(A, g, L, x) and not eliminate(A.copy(), g.copy(), x):
+                return False
+            move(T, x)
+            for r in range(SHARED):
+                shared_now[r] -= x[n - SHARED + r]
+            turn, shift = 0.0, 0.0
+            for r in range(n - SHARED):
+                if r % 6 < 3:
+                    turn = max(turn, abs(x[r]))
+                else:
+                    shift = max(shift, abs(x[r]))
+            if shift < stop_m and turn < stop_rad:
+                break
     return True
