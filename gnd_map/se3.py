@@ -20,6 +20,11 @@ def R_from_quaternion_xyzw(q: npt.ArrayLike) -> F64:
         ShapeError: a quaternion has no length, or none that is finite.
     """
     quaternion = np.asarray(q, dtype=np.float64)
+    if quaternion.shape == (4,):
+        x, y, z, w = quaternion.tolist()
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        if 0.0 < norm < math.inf:
+            return _R_of_one(x / norm, y / norm, z / norm, w / norm)
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     if quaternion.shape[-1:] != (4,) or not ((length > 0.0) & (length < np.inf)).all():
@@ -77,7 +82,11 @@ def _exp_of_one(x: float, y: float, z: float) -> F64:
     """One rotation in plain numbers: a solver's loop asks for thousands, and numpy takes 0.1 ms for each."""
     angle = math.sqrt(x * x + y * y + z * z)
     half_sine = math.sin(0.5 * angle) / angle if angle > 1e-8 else 0.5
-    x, y, z, w = half_sine * x, half_sine * y, half_sine * z, math.cos(0.5 * angle)
+    return _R_of_one(half_sine * x, half_sine * y, half_sine * z, math.cos(0.5 * angle))
+
+
+def _R_of_one(x: float, y: float, z: float, w: float) -> F64:
+    """(3, 3) of one unit quaternion."""
     return np.array(
         [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
@@ -112,6 +121,11 @@ def T_from_R_t(R: npt.ArrayLike, t_m: npt.ArrayLike) -> F64:
 def T_inverse(T: npt.ArrayLike) -> F64:
     """(..., 4, 4) inverse poses: T_src_dst of T_dst_src."""
     pose = np.asarray(T, dtype=np.float64)
+    if pose.shape == (4, 4):
+        inverse = np.eye(4)
+        inverse[:3, :3] = pose[:3, :3].T
+        inverse[:3, 3] = -(inverse[:3, :3] @ pose[:3, 3])
+        return inverse
     R = np.swapaxes(pose[..., :3, :3], -1, -2)
     return T_from_R_t(R, -np.einsum("...ij,...j->...i", R, pose[..., :3, 3]))
 

@@ -150,7 +150,7 @@ def _check_cloud(cloud: PointCloud, dtype: np.dtype[np.void], size: int) -> None
     if size % dtype.itemsize:
         raise BadValue(f"{size} bytes of points are no multiple of the {dtype.itemsize} bytes of a point")
     check_length("point cloud", size // dtype.itemsize, limits.MAX_POINTS_OF_SCAN, "points")
-    if not np.allclose(_T_of(cloud.pose), np.eye(4)):
+    if cloud.pose != _NO_POSE and not np.allclose(_T_of(cloud.pose), np.eye(4)):
         raise BadValue(f"point cloud has a pose of its own in frame {cloud.frame_id!r}; expected points of the sensor")
 
 
@@ -235,6 +235,9 @@ def transform_message_of(t_ns: int, parent: str, child: str, T_parent_child: F64
 def T_of_transform(message: FrameTransform) -> F64:
     """(4, 4) T_parent_child of a foxglove.FrameTransform."""
     return _T_of(Pose(position=message.translation, orientation=message.rotation))
+
+
+_NO_POSE: Final = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
 
 def _pose_of(T: F64) -> Pose:

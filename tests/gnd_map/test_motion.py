@@ -92,3 +92,21 @@ def test_a_trajectory_answers_one_time_or_many() -> None:
 def test_a_trajectory_must_run_forward() -> None:
     with pytest.raises(MotionError, match="pose 2 of 3"):
         Trajectory(np.array([0, 5, 5]), np.tile(np.eye(4), (3, 1, 1)))
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1e-12, 1e-6, 0.4, 2.0, 3.0, np.pi - 1e-7])
+def test_poses_of_a_trajectory_are_those_of_the_plain_interpolation(turn_rad: float) -> None:
+    rng = np.random.default_rng(1)
+    axes = rng.normal(size=(12, 3))
+    steps = exp_so3(turn_rad * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    R = [exp_so3(rng.normal(size=3))]
+    for step in steps[1:]:
+        R.append(R[-1] @ step)
+    t_ns = START_NS + np.cumsum(rng.integers(1, 30_000_000, len(R)))
+    path = Trajectory(t_ns, T_from_R_t(np.stack(R), rng.normal(scale=1e3, size=(len(R), 3))))
+    query = np.concatenate([t_ns, rng.integers(t_ns[0] - 10**7, t_ns[-1] + 10**7, 200)])
+    plain = interpolate_poses(t_ns, path.T_dst_vehicle, query, tolerance_ns=10**8)
+    np.testing.assert_allclose(path.at(query), plain, atol=1e-9)
+    np.testing.assert_allclose(path.at(int(query[-1])), plain[-1], atol=1e-9)
+    one = Trajectory(t_ns[:1], path.T_dst_vehicle[:1])
+    np.testing.assert_array_equal(one.at(t_ns[0] + np.arange(2)), np.repeat(one.T_dst_vehicle, 2, axis=0))

@@ -69,6 +69,7 @@ class PoseGraph:
         self.parameters = parameters
         # A little longer than our lag, so that a pose is taken out before the smoother forgets it.
         self._smoother = gtsam.BatchFixedLagSmoother(parameters.lag_s + SLACK_S)
+        self._solved: tuple[gtsam.Values, gtsam.Marginals] | None = None  # since the last update
         self._t_ns: dict[int, int] = {}
         self._first_ns = 0
         self._next = 0
@@ -112,6 +113,7 @@ class PoseGraph:
         self._t_ns[number] = t_ns
         self._next += 1
         self._smoother.update(factors, values, {number: (t_ns - self._first_ns) * 1e-9})
+        self._solved = None
         return final
 
     def restart(self, T_map_vehicle: F64, covariance: F64) -> None:
@@ -123,6 +125,7 @@ class PoseGraph:
         self._t_ns = {number: self._t_ns[number]}
         self._smoother = gtsam.BatchFixedLagSmoother(self.parameters.lag_s + SLACK_S)
         self._smoother.update(factors, values, {number: (self._t_ns[number] - self._first_ns) * 1e-9})
+        self._solved = None
 
     def _leaving(self, now_ns: int) -> list[SmoothedPose]:
         return self._take([n for n, t in self._t_ns.items() if now_ns - t > self.parameters.lag_s * 1e9])
@@ -139,9 +142,13 @@ class PoseGraph:
         """Poses inside the lag with their marginal covariances."""
         if not numbers:
             return []
-        marginals = gtsam.Marginals(self._smoother.getFactors(), self._smoother.calculateEstimate())
+        if self._solved is None:
+            estimate = self._smoother.calculateEstimate()
+            self._solved = estimate, gtsam.Marginals(self._smoother.getFactors(), estimate)
+        poses, marginals = self._solved
         return [
-            SmoothedPose(n, self._t_ns[n], self.pose(n), np.asarray(marginals.marginalCovariance(n))) for n in numbers
+            SmoothedPose(n, self._t_ns[n], poses.atPose3(n).matrix(), np.asarray(marginals.marginalCovariance(n)))
+            for n in numbers
         ]
 
     def _take(self, numbers: list[int]) -> list[SmoothedPose]:

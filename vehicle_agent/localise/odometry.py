@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.localise.odometry_kernels import integrate, resampled
 
 KEEP_NS = 45_000_000_000  # more than any lag, and than the steps that the clock is estimated from
 MAX_ACCELERATION_MPS2 = 15.0  # tyres on dry tarmac hold about 10
@@ -144,29 +145,20 @@ class MotionBuffer:
 
         Beyond the samples the nearest one is continued; without any the vehicle is taken to stand.
         """
+        return Trajectory(*self._driven(first_ns, last_ns))
+
+    def _driven(self, first_ns: int, last_ns: int) -> tuple[NDArray[np.int64], F64]:
+        """Times (N,) and poses (N, 4, 4) of `trajectory`."""
         t, speed, yaw_rate = self._resampled(first_ns, last_ns)
-        dt = np.diff(t) * 1e-9
-        dyaw = 0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * dt
-        ds = 0.5 * (speed[1:] + speed[:-1]) * dt
-        yaw = np.concatenate([[0.0], np.cumsum(dyaw)])
-        chord = ds * np.sinc(dyaw / (2 * np.pi))  # a chord of the arc
-        middle = yaw[:-1] + 0.5 * dyaw
-        cos, sin = np.cos(middle), np.sin(middle)
-        T = np.zeros((len(t), 4, 4))
-        T[:, 0, 0] = T[:, 1, 1] = np.cos(yaw)
-        T[:, 1, 0] = np.sin(yaw)
-        T[:, 0, 1] = -T[:, 1, 0]
-        T[:, 2, 2] = T[:, 3, 3] = 1.0
-        T[1:, 0, 3] = np.cumsum(chord * (cos - self.course[0] * sin))
-        T[1:, 1, 3] = np.cumsum(chord * (sin + self.course[0] * cos))
-        T[1:, 2, 3] = np.cumsum(ds * self.course[1])
-        return Trajectory(t, T)
+        T = np.empty((len(t), 4, 4))
+        integrate(t, speed, yaw_rate, self.course, T)
+        return t, T
 
     def delta(self, first_ns: int, last_ns: int) -> F64:
         """(4, 4) T_first_last: the motion from `first_ns` to `last_ns`, in either order."""
         if last_ns < first_ns:
             return T_inverse(self.delta(last_ns, first_ns))
-        return np.asarray(self.trajectory(first_ns, last_ns).T_dst_vehicle[-1])
+        return np.asarray(self._driven(first_ns, last_ns)[1][-1])
 
     def changes(self, first_ns: int, last_ns: int) -> tuple[float, float]:
         """What speed [m/s] and yaw rate [rad/s] changed by between two times: what an offset of the clock acts on."""
@@ -178,12 +170,5 @@ class MotionBuffer:
         low = max(bisect_left(self._t_ns, self.clock.stamp(first_ns)) - 1, 0)
         high = min(bisect_left(self._t_ns, self.clock.stamp(last_ns)) + 1, len(self._t_ns))
         known = self.clock.of_stamps(np.array(self._t_ns[low:high], np.int64))
-        inner = known[(known > first_ns) & (known < last_ns)]
-        end = [last_ns] if last_ns > first_ns else []
-        t = np.concatenate([[first_ns], inner, end]).astype(np.int64)
-        if not len(known):
-            return t, np.zeros(len(t)), np.zeros(len(t))
-        at, x = (t - first_ns).astype(np.float64), (known - first_ns).astype(np.float64)
-        speed = np.interp(at, x, self._speed_mps[low:high])
-        yaw_rate = np.interp(at, x, self._yaw_rate_radps[low:high])
-        return t, speed * self.speed_scale, yaw_rate - self.yaw_bias_radps
+        speed, yaw_rate = np.array(self._speed_mps[low:high]), np.array(self._yaw_rate_radps[low:high])
+        return resampled(known, speed * self.speed_scale, yaw_rate - self.yaw_bias_radps, first_ns, last_ns)

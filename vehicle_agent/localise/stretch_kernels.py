@@ -231,9 +231,9 @@ def normal_equations(
 ) -> None:  # fmt: skip
     """Fill A (n, n) and g (n,), n = 6 N + `SHARED`, of a stretch of N poses T (N, 4, 4) that all have a match.
 
-    weight (N,) is that of each match, T_match, H and slope are as in `match_moved`, the steps as in `residuals`. What is
-    known of the first pose and of `shared_now` (`SHARED`,): T_belief (4, 4), shared_belief (`SHARED`,), and information
-    (10, 10) and gradient (10,) there.
+    weight (N,) is that of each match, T_match, H and slope are as in `match_moved`, the steps as in `residuals`. What
+    is known of the first pose and of `shared_now` (`SHARED`,): T_belief (4, 4), shared_belief (`SHARED`,), and
+    information (10, 10) and gradient (10,) there.
     """
     n, m = g.shape[0], first.shape[0]
     A[:] = 0.0
