@@ -1,5 +1,6 @@
 """Array types and the one check that every value of this package makes of its arrays."""
 
+import math
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -63,3 +64,19 @@ def points_3d(name: str, points: object) -> F64:
     array = np.ascontiguousarray(points, dtype=np.float64)
     check_array(name, array, np.float64, (None, 3))
     return array
+
+
+def numbered_rows(rows: I64) -> I64:
+    """(N,) which of the different rows of `rows` (N, K) int64 each one is, in their order; `numpy.unique` along an axis
+    is far slower, and asked only where the ranges are so large that a row is no single number.
+    """
+    if not len(rows):
+        return np.empty(0, np.int64)
+    low = rows.min(axis=0)
+    spans = (rows.max(axis=0) - low + 1).tolist()
+    if math.prod(spans) >= 1 << 62:
+        return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    key = np.zeros(len(rows), np.int64)
+    for column, span in enumerate(spans):
+        key = key * span + (rows[:, column] - low[column])
+    return np.unique(key, return_inverse=True)[1].astype(np.int64)

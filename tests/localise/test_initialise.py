@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
 
-from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, initialise
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, HIT, NEXT_TO, _field, initialise
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -60,3 +60,13 @@ def test_the_number_of_hypotheses_grows_with_the_circle(yard_map, yard_points):
     assert near is not None
     assert far is not None
     assert far.hypotheses > 6 * near.hypotheses
+
+
+def test_the_field_that_is_scored_equals_its_plain_twin():
+    index = np.random.default_rng(2).choice(np.array([-2, -1, 7], np.int32), (9, 8, 7), p=[0.2, 0.6, 0.2])
+    occupied, plain = np.pad(index >= 0, 1), np.zeros(index.shape, np.uint8)
+    for axis in range(3):
+        for side in (-1, 1):
+            plain[np.roll(occupied, side, axis)[1:-1, 1:-1, 1:-1]] = NEXT_TO
+    plain[index >= 0] = HIT
+    np.testing.assert_array_equal(_field(index), plain)

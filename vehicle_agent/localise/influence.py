@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64, numbered_rows
 from gnd.vehicle_agent.localise.kernels import pulls
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, Linearised
@@ -62,8 +62,8 @@ def influence(seen: Sequence[SeenScan], match_map: MatchMap) -> Influence:
     if not len(touched):
         return Influence(np.ones(n), np.zeros(n))
     cells = np.floor(match_map.mean_m[touched] / PIECE_M).astype(np.int64)
-    _, piece = np.unique(cells, axis=0, return_inverse=True)
-    pull, weight = (_summed(piece.ravel(), of[touched]) for of in (pull, weight))
+    piece = numbered_rows(cells)
+    pull, weight = (_summed(piece, of[touched]) for of in (pull, weight))
     return _of_pieces(pull, weight)
 
 

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64, I32
 from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
@@ -257,17 +257,29 @@ def _score(points_m: F64, hypotheses: F64, m: MatchMap) -> F64:
     return scores
 
 
-def _field(index: NDArray[np.int32]) -> U8:
+def _field(index: I32) -> U8:
     """(nx, ny, nz) uint8: HIT in a voxel with a Gaussian, NEXT_TO in its six neighbours, else 0."""
-    occupied = index >= 0
     field = np.zeros(index.shape, np.uint8)
-    for axis in range(3):
-        low, high = [slice(None)] * 3, [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        field[tuple(low)] |= occupied[tuple(high)] * np.uint8(NEXT_TO)
-        field[tuple(high)] |= occupied[tuple(low)] * np.uint8(NEXT_TO)
-    field[occupied] = HIT
+    _mark(index, field)
     return field
+
+
+@kernel
+def _mark(index: I32, field: U8) -> None:
+    """Fill `field`, which is 0, by `index` (nx, ny, nz): see `_field`."""
+    nx, ny, nz = index.shape
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                if index[x, y, z] < 0:
+                    continue
+                field[x, y, z] = HIT
+                for k in range(6):
+                    i = x + (1 if k == 0 else -1 if k == 1 else 0)
+                    j = y + (1 if k == 2 else -1 if k == 3 else 0)
+                    h = z + (1 if k == 4 else -1 if k == 5 else 0)
+                    if 0 <= i < nx and 0 <= j < ny and 0 <= h < nz and index[i, j, h] < 0:
+                        field[i, j, h] = NEXT_TO
 
 
 @kernel

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.arrays import F64, I64, numbered_rows
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.first_pose import SearchPlace
@@ -307,7 +307,7 @@ def fits_at(points_m: F64, T_map_vehicle: F64, m: MatchMap, parameters: Registra
 def patches_of(points_m: F64, side_m: float) -> I64:
     """(N,) number of the square of the ground that each of points (N, 3) stands on."""
     square = np.floor(points_m[:, :2] / side_m).astype(np.int64)
-    return np.unique(square, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return numbered_rows(square)
 
 
 def ahead(difference: F64, patches: I64, full_points: int) -> float:
