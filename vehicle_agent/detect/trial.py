@@ -35,6 +35,8 @@ _POINTS_OF_SEGMENT: Final = 3000
 _LEAST_POINTS_OF_SCAN: Final = 300
 POINTS_OF_POOR_SCAN: Final = 300
 _MAX_RANGE_M: Final = 50.0
+_SPREAD: Final = 8
+"""Of the scans that are evidence and wait to be given, one and this part are given a scan."""
 _EVERY_RECENT: Final = 2
 """So many of the last good segment's points are enough to compare with."""
 
@@ -119,6 +121,8 @@ class Trial:
         self._map = match_map
         self._open: _Segment | None = None
         self._passed: list[_TrialScan] = []
+        self._stood: deque[_TrialScan] = deque()
+        """Evidence that was not given yet: a whole segment stands the test at once, and is given scan by scan."""
         self._wrong = False  # the segment before was
         self._tried: deque[Tried] = deque()
         self._refused_until_ns = -1
@@ -131,28 +135,33 @@ class Trial:
             self.counts["scans_taken_back"] += 1
             return
         if self._open is not None and t_ns - self._open.first_ns >= SEGMENT_NS:
-            yield from self._close()
+            self._close()
         if self._open is None:
             self._open = _Segment(t_ns)
         self._open.scans.append(_TrialScan.of(segmented))
+        for _ in range(1 + len(self._stood) // _SPREAD if self._stood else 0):
+            yield self._stood.popleft().restore()
 
     def flush(self) -> Iterator[SegmentedScan]:
         """The drive has ended: give what has stood the test until now."""
-        yield from self._close()
-        yield from self._release(self._passed)
+        self._close()
+        self._stood.extend(self._passed)
         self._passed = []
+        while self._stood:
+            yield self._stood.popleft().restore()
 
     @property
     def oldest(self) -> PoseEstimate | None:
         """Pose of the oldest scan that waits."""
-        waiting = self._passed or (self._open.scans if self._open is not None else [])
+        waiting = self._stood or self._passed or (self._open.scans if self._open is not None else [])
         return waiting[0].estimate if waiting else None
 
     def take_back(self, until_ns: int) -> None:
         """The pose was wrong, and it is not known since when: no scan up to this time counts."""
         self._refused_until_ns = max(self._refused_until_ns, until_ns)
-        waiting = len(self._passed) + (len(self._open.scans) if self._open is not None else 0)
+        waiting = len(self._stood) + len(self._passed) + (len(self._open.scans) if self._open is not None else 0)
         self.counts["scans_taken_back"] += waiting
+        self._stood.clear()
         self._open, self._passed, self._recent, self._wrong = None, [], None, True
 
     def take_tried(self) -> list[Tried]:
@@ -160,7 +169,8 @@ class Trial:
         tried, self._tried = list(self._tried), deque()
         return tried
 
-    def _close(self) -> Iterator[SegmentedScan]:
+    def _close(self) -> None:
+        """Test the open segment; if its poses stand, those of the one before do, too."""
         segment, self._open = self._open, None
         if segment is None:
             return
@@ -175,7 +185,7 @@ class Trial:
             self.counts["scans_taken_back"] += tried.scans
             self._wrong = tried.verdict == "unchecked"  # nothing is there that would prove the pose right again
         else:
-            yield from self._release(before)
+            self._stood.extend(before)
             self._passed = segment.scans
 
     def _try(self, scans: list[_TrialScan]) -> Tried:
@@ -216,11 +226,6 @@ class Trial:
             return shift.z
         z = gain(points_m, T, X_step @ T, recent_map(near, self._map.noise_m))
         return max(shift.z, (shift.z + z) / math.sqrt(2.0)) if min(shift.z, z) > 0.0 else 0.0
-
-    @staticmethod
-    def _release(scans: list[_TrialScan]) -> Iterator[SegmentedScan]:
-        while scans:
-            yield scans.pop(0).restore()
 
 
 def some_of(points_m: F32, centre_map_m: F64, n: int) -> F64:

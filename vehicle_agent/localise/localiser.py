@@ -31,6 +31,8 @@ _LOST_GAP_S: Final = 15.0
 _OUTSIDE_M: Final = 0.1
 _OUTSIDE_RAD: Final = 0.01
 """One sigma of a pose from outside."""
+_SPREAD: Final = 8
+"""Of the scans that wait with a final pose, one and this part are given a scan."""
 _PAST_NS: Final = 1_000_000_000
 _MOST_FROM_PAST: Final = 5
 """So many scans in a row that are older than the newest by more: the clock was wrong before."""
@@ -139,7 +141,8 @@ class Localiser:
         track, self._track = self._track, None
         if track is not None:
             self._ready.extend(track.flush())
-        return self._take_ready()
+        while self._ready:
+            yield self._placed()
 
     @property
     def state(self) -> tuple[Health, Cause]:
@@ -327,5 +330,12 @@ class Localiser:
         self._lose("bad_time")
 
     def _take_ready(self) -> Iterator[RefinedScan]:
-        while self._ready:
-            yield self._drive.output.final(*self._ready.popleft())
+        """Some of the scans whose poses are final: several become so at once, and who works them off must not be late
+        for the next scan.
+        """
+        for _ in range(1 + len(self._ready) // _SPREAD if self._ready else 0):
+            yield self._placed()
+
+    def _placed(self) -> RefinedScan:
+        """The oldest scan whose pose is final."""
+        return self._drive.output.final(*self._ready.popleft())

@@ -290,6 +290,8 @@ class Reporter:
         self._tracks.touched(touched)
         open_tiles = set(touched) | set(self._doubts.tiles())
         left = left_behind(frame, open_tiles, p_map, self._left_behind_m)
+        if len(left) > 1:  # the rest with the next scans: several at once would make the vehicle late
+            left, self._looked_at = sorted(left)[:1], None
         self._decide(left, odometer_m)
         self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._left_behind_m))
         self._open_districts = {t.district for t in open_tiles - set(left)}
