@@ -14,12 +14,12 @@ from collections.abc import Collection
 import numpy as np
 import numpy.typing as npt
 
-from gnd.gnd_map.arrays import F64, I32, I64, points_3d
+from gnd.gnd_map.arrays import F64, I32, I64, U8, points_3d
 from gnd.gnd_map.gaussian import Gaussians, Moments, full_matrices, six_entries
 from gnd.gnd_map.geodesy import enu_axes
 from gnd.gnd_map.grid import MAX_HEIGHT_M, GridFrame, tile_axes
-from gnd.gnd_map.jit import kernel
-from gnd.gnd_map.near_grid import grid_near
+from gnd.gnd_map.jit import bare_inlined, kernel
+from gnd.gnd_map.near_grid import expansion_about, grid_near, near_grid_of
 from gnd.gnd_map.tile_id import TileId
 
 N_MIN_CELLS = 20
@@ -72,6 +72,21 @@ class VoxelAccumulator:
             done, self._used, ignored = _accumulate(
                 g, done, self._bounds, self._key_origin, self._used, self._table, self._key, self._count, self._cells,
                 self._bits, self._sums,
+            )  # fmt: skip
+            self.ignored += ignored
+
+    def add_marked(self, points_map_m: F64, marks: U8) -> None:
+        """As `add`, of the points (N, 3), C-contiguous float64, whose mark (N,) is not 0; nothing is copied."""
+        near, done = expansion_about(self.grid_frame, points_map_m, marks), 0
+        if near is None:
+            self.add(points_map_m[marks != 0])
+            return
+        while done < len(points_map_m):
+            if self._used >= len(self._key):
+                self._grow()
+            done, self._used, ignored = _accumulate_marked(
+                points_map_m, marks, *near, done, self._bounds, self._key_origin, self._used, self._table, self._key,
+                self._count, self._cells, self._bits, self._sums,
             )  # fmt: skip
             self.ignored += ignored
 
@@ -156,7 +171,7 @@ def _split_key(key: I64) -> I64:
     return np.stack([key >> 42, (key >> 21) & mask, key & mask], axis=-1)
 
 
-@kernel
+@bare_inlined
 def _slot_of(table: I32, keys: I64, key: np.int64) -> np.uint64:
     """Slot of the table that holds `key`, or the free one where it belongs (Fibonacci hash, linear probing)."""
     mask = np.uint64(table.shape[0] - 1)
@@ -191,29 +206,77 @@ def _accumulate(
     ignored = 0
     last_key, row = np.int64(-1), np.int64(-1)
     for i in range(start, g.shape[0]):
-        fx, fy, fz = np.floor(g[i, 0]), np.floor(g[i, 1]), np.floor(g[i, 2])
-        if (
-            fx < bounds[0, 0] or fy < bounds[0, 1] or fz < bounds[0, 2]
-            or fx >= bounds[1, 0] or fy >= bounds[1, 1] or fz >= bounds[1, 2]
-        ):  # fmt: skip
+        key = _key_of(g[i, 0], g[i, 1], g[i, 2], bounds, key_origin)
+        if key < 0:
             ignored += 1
             continue
-        kx, ky, kz = np.int64(fx) - key_origin[0], np.int64(fy) - key_origin[1], np.int64(fz) - key_origin[2]
-        key = (kx << 42) | (ky << 21) | kz
         if key != last_key:
-            slot = _slot_of(table, keys, key)
-            if table[slot] < 0:
-                if used >= keys.shape[0]:
-                    return i, used, ignored
-                table[slot] = used
-                keys[used] = key
-                used += 1
-            last_key, row = key, np.int64(table[slot])
-        _take(row, g[i, 0] - fx, g[i, 1] - fy, g[i, 2] - fz, count, cells, bits, sums)
+            row, used = _row_of(key, used, table, keys)
+            if row < 0:
+                return i, used, ignored
+            last_key = key
+        _take(
+            row, g[i, 0] - np.floor(g[i, 0]), g[i, 1] - np.floor(g[i, 1]), g[i, 2] - np.floor(g[i, 2]),
+            count, cells, bits, sums,
+        )  # fmt: skip
     return g.shape[0], used, ignored
 
 
 @kernel
+def _accumulate_marked(
+    points: F64, marks: U8, middle: F64, R_local_map: F64, g_middle: F64, steps: F64, curvature: F64, start: int,
+    bounds: I64, key_origin: I64, used: int, table: I32, keys: I64, count: I64, cells: I32,
+    bits: npt.NDArray[np.uint64], sums: F64,
+) -> tuple[int, int, int]:  # fmt: skip
+    """As `_accumulate`, of the marked points from `start` on, whose grid coordinates are found on the way."""
+    ignored = 0
+    last_key, row = np.int64(-1), np.int64(-1)
+    for i in range(start, points.shape[0]):
+        if not marks[i]:
+            continue
+        x, y, z = near_grid_of(
+            points[i, 0], points[i, 1], points[i, 2], middle, R_local_map, g_middle, steps, curvature
+        )
+        key = _key_of(x, y, z, bounds, key_origin)
+        if key < 0:
+            ignored += 1
+            continue
+        if key != last_key:
+            row, used = _row_of(key, used, table, keys)
+            if row < 0:
+                return i, used, ignored
+            last_key = key
+        _take(row, x - np.floor(x), y - np.floor(y), z - np.floor(z), count, cells, bits, sums)
+    return points.shape[0], used, ignored
+
+
+@bare_inlined
+def _key_of(x: float, y: float, z: float, bounds: I64, key_origin: I64) -> int:
+    """Key of the voxel of grid coordinates; -1 outside `bounds` (2, 3)."""
+    fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+    if (
+        fx < bounds[0, 0] or fy < bounds[0, 1] or fz < bounds[0, 2]
+        or fx >= bounds[1, 0] or fy >= bounds[1, 1] or fz >= bounds[1, 2]
+    ):  # fmt: skip
+        return np.int64(-1)
+    kx, ky, kz = np.int64(fx) - key_origin[0], np.int64(fy) - key_origin[1], np.int64(fz) - key_origin[2]
+    return (kx << 42) | (ky << 21) | kz
+
+
+@bare_inlined
+def _row_of(key: np.int64, used: int, table: I32, keys: I64) -> tuple[np.int64, int]:
+    """Row of a voxel, made if it has none, and the rows used then; -1 where there is no row left."""
+    slot = _slot_of(table, keys, key)
+    if table[slot] < 0:
+        if used >= keys.shape[0]:
+            return np.int64(-1), used
+        table[slot] = used
+        keys[used] = key
+        used += 1
+    return np.int64(table[slot]), used
+
+
+@bare_inlined
 def _take(
     row: np.int64,
     px: float,

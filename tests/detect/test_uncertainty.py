@@ -77,7 +77,7 @@ def test_each_tile_gets_the_mean_variance_of_its_own_points(tiles: Tiles) -> Non
     expected: dict[int, list[tuple[float, float, float]]] = {}
     for k, pose in enumerate(poses):
         points = SENSOR + rng.uniform(-30, 30, (300, 3)) * [1, 1, 0] + [20.0 * k, 0.0, 0.0]
-        uncertainties.add_scan(points, SENSOR, GRID_FRAME.affine(SENSOR), pose)
+        uncertainties.add_scan(points, len(points), SENSOR, GRID_FRAME.affine(SENSOR), pose)
         for code, p in zip(tile_of(points), points, strict=True):
             row = (pose.sigma_m**2, pose.sigma_rad**2, float(((p - SENSOR) ** 2).sum()))
             expected.setdefault(code, []).append(row)
@@ -93,8 +93,9 @@ def test_each_tile_gets_the_mean_variance_of_its_own_points(tiles: Tiles) -> Non
 def test_large_scans_are_sampled_and_still_count_for_what_they_are() -> None:
     uncertainties = TileUncertainties(GRID_FRAME)
     points = np.broadcast_to(SENSOR + np.array([3.0, 0.0, 0.0]), (50_000, 3))
-    uncertainties.add_scan(points, SENSOR, GRID_FRAME.affine(SENSOR), PoseUncertainty(0.0))
-    uncertainties.add_scan(points[:12_500], SENSOR, GRID_FRAME.affine(SENSOR), PoseUncertainty(0.1))
+    for n, sigma_m in ((50_000, 0.0), (12_500, 0.1)):
+        some = points[: n : poses_step(n)]
+        uncertainties.add_scan(some, n, SENSOR, GRID_FRAME.affine(SENSOR), PoseUncertainty(sigma_m))
     found = uncertainties.mean()
     assert found.sigma_m == pytest.approx(np.sqrt(0.2 * 0.1**2), rel=0.01)
     assert found.range_m == pytest.approx(3.0)

@@ -180,3 +180,20 @@ def test_points_that_are_not_finite_are_refused_whole() -> None:
     with pytest.raises(ShapeError, match="2 of 6 values are not finite"):
         accumulator.add(np.array([[0.0, 0.0, 0.0], [np.nan, np.inf, 0.0]]))
     assert len(accumulator) == 0
+
+
+@pytest.mark.parametrize("spread_m", [40.0, 400.0])  # the second is too wide for the expansion
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_marked_points_are_taken_as_if_they_were_copied(spread_m: float, share: float) -> None:
+    rng = np.random.default_rng(7)
+    points = rng.normal(scale=spread_m / 3.0, size=(20_000, 3)) * [1.0, 1.0, 0.1]
+    marks = (rng.random(len(points)) < share).astype(np.uint8)
+    one, other = VoxelAccumulator(FRAME), VoxelAccumulator(FRAME)
+    one.add_marked(points, marks)
+    other.add(points[marks != 0])
+    assert len(one) == len(other)
+    assert one.ignored == other.ignored
+    (g, moments), (g_other, moments_other) = one.moments(), other.moments()
+    np.testing.assert_array_equal(g, g_other)
+    np.testing.assert_array_equal(moments.count, moments_other.count)
+    np.testing.assert_array_equal(moments.sum_m, moments_other.sum_m)

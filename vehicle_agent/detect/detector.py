@@ -16,7 +16,7 @@ from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.detect.kernel import CERTAIN, cast_rays, kernel_parameters, window_affine
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, Records, make_records
-from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, poses_step
 from gnd.vehicle_agent.errors import MapChanged
 from gnd.vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
 
@@ -48,6 +48,7 @@ class ChangeDetector:
         self._poses = TileUncertainties(local_map.grid_frame)
         self._window: _VoxelWindow | None = None
         self._sees_heights = False
+        self._room = [np.empty((0, 3)), np.empty((0, 3))]
 
     def add_scan(
         self,
@@ -90,14 +91,20 @@ class ChangeDetector:
         A, b = window_affine(*affine, window.anchor_m, window.origin_g)
         kept = np.zeros(len(points), np.uint8)
         cast = cast_rays(
-            points - window.anchor_m, origins - window.anchor_m, A, b, window.state.reshape(-1), window.state.shape,
+            self._about(points, window.anchor_m, 0), self._about(origins, window.anchor_m, 1), A, b, window.state.reshape(-1), window.state.shape,
             window.records.words, window.records.floats, window.records.block,
             kernel_parameters(self.parameters, pose), moves, kept,
         )  # fmt: skip
-        evidence = points[kept.view(np.bool_)]
-        self._points.add(evidence)
-        self._poses.add_scan(evidence, middle, affine, pose)
+        self._points.add_marked(points, kept)
+        evidence = np.flatnonzero(kept)
+        self._poses.add_scan(points[evidence[:: poses_step(len(evidence))]], len(evidence), middle, affine, pose)
         return cast
+
+    def _about(self, points: F64, anchor_m: F64, which: int) -> F64:
+        """Points (N, 3) relative to an anchor (3,), in memory that stays: new pages cost more than the difference."""
+        if len(self._room[which]) < len(points):
+            self._room[which] = np.empty((len(points), 3))
+        return np.subtract(points, anchor_m, out=self._room[which][: len(points)])
 
     def touched(self, tile_id: TileId) -> bool:
         """Whether there is evidence about a voxel of this tile."""

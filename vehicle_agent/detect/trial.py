@@ -14,7 +14,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F32, F64
+from gnd.gnd_map.arrays import BOOL, F32, F64
+from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.detect.recent_map import recent_map
 from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, find_shift, gain
@@ -60,9 +61,10 @@ class _TrialScan:
         """The scan as it came."""
         return SegmentedScan(RefinedScan(self.t_ns, *self.rays.restore(), self.estimate), self.moving)
 
-    def still(self) -> F32:
-        """(K, 3) the points that stand, from the centre of its rays."""
-        return self.rays.points_m[~self.moving]
+    def still(self, every: int = 1, centre_m: F64 | None = None) -> F32:
+        """(K, 3) every so many of the points that stand, from the centre of its rays or another one (3,)."""
+        off = np.zeros(3) if centre_m is None else self.rays.centre_m - centre_m
+        return _standing(self.rays.points_m, self.moving, every, off.astype(np.float32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +101,7 @@ class _Recent:
     @classmethod
     def of(cls, scans: list[_TrialScan], X: F64) -> "_Recent":
         centre = scans[0].rays.centre_m
-        still = [held.still()[::_EVERY_RECENT] + (held.rays.centre_m - centre).astype(np.float32) for held in scans]
+        still = [held.still(_EVERY_RECENT, centre) for held in scans]
         return cls(centre, np.concatenate(still), X)
 
 
@@ -226,6 +228,24 @@ class Trial:
             return shift.z
         z = gain(points_m, T, X_step @ T, recent_map(near, self._map.noise_m))
         return max(shift.z, (shift.z + z) / math.sqrt(2.0)) if min(shift.z, z) > 0.0 else 0.0
+
+
+@kernel
+def _standing(points: F32, moving: BOOL, every: int, off: F32) -> F32:
+    """(K, 3) every so many of the points (N, 3) that do not move, moved by `off` (3,)."""
+    n = 0
+    for i in range(points.shape[0]):
+        n += not moving[i]
+    out, seen, k = np.empty(((n + every - 1) // every, 3), np.float32), 0, 0
+    for i in range(points.shape[0]):
+        if moving[i]:
+            continue
+        if seen % every == 0:
+            for axis in range(3):
+                out[k, axis] = points[i, axis] + off[axis]
+            k += 1
+        seen += 1
+    return out
 
 
 def some_of(points_m: F32, centre_map_m: F64, n: int) -> F64:

@@ -57,6 +57,11 @@ class PoseUncertainty:
         return math.hypot(self.sigma_m, self.range_m * self.sigma_rad)
 
 
+def poses_step(n: int) -> int:
+    """Of n points, every so many tell which tiles a scan sees."""
+    return 1 + n // POINTS_OF_A_SCAN
+
+
 class TileUncertainties:
     """Mean variances of the poses by tile, each scan weighted with the share of its points that ended in the tile."""
 
@@ -64,17 +69,19 @@ class TileUncertainties:
         self._grid_frame = grid_frame
         self._sums: dict[int, F64] = {}  # weight, position and heading variance, squared range, each times weight
 
-    def add_scan(self, points_map_m: F64, origin_map_m: F64, affine: tuple[F64, F64], pose: PoseUncertainty) -> None:
-        """Take the points (N, 3) of a scan that are evidence, seen from about `origin_map_m` (3,), map frame.
+    def add_scan(
+        self, some_map_m: F64, n: int, origin_map_m: F64, affine: tuple[F64, F64], pose: PoseUncertainty
+    ) -> None:
+        """Take a scan with n points that are evidence, seen from about `origin_map_m` (3,), map frame.
 
         Args:
-            points_map_m: float64.
+            some_map_m: (K, 3) float64, every `poses_step(n)`-th of them.
+            n: how many they are.
             origin_map_m: float64.
             affine: of the grid frame there, `GridFrame.affine`.
             pose: of the scan.
         """
-        step = 1 + len(points_map_m) // POINTS_OF_A_SCAN
-        some = points_map_m[::step]
+        some, step = some_map_m, poses_step(n)
         if not len(some):
             return
         A, b = affine
