@@ -18,7 +18,7 @@ from gnd.gnd_map.arrays import F64, I32, I64, U8, points_3d
 from gnd.gnd_map.gaussian import Gaussians, Moments, full_matrices, six_entries
 from gnd.gnd_map.geodesy import enu_axes
 from gnd.gnd_map.grid import MAX_HEIGHT_M, GridFrame, tile_axes
-from gnd.gnd_map.jit import bare_inlined, kernel
+from gnd.gnd_map.jit import bare, bare_inlined
 from gnd.gnd_map.near_grid import expansion_about, grid_near, near_grid_of
 from gnd.gnd_map.tile_id import TileId
 
@@ -181,14 +181,14 @@ def _slot_of(table: I32, keys: I64, key: np.int64) -> np.uint64:
     return slot
 
 
-@kernel
+@bare
 def _rehash(table: I32, keys: I64, used: int) -> None:
     """Fill an empty table with the rows 0 … used-1."""
     for row in range(used):
         table[_slot_of(table, keys, keys[row])] = row
 
 
-@kernel
+@bare
 def _accumulate(
     g: F64,
     start: int,
@@ -222,7 +222,7 @@ def _accumulate(
     return g.shape[0], used, ignored
 
 
-@kernel
+@bare
 def _accumulate_marked(
     points: F64, marks: U8, middle: F64, R_local_map: F64, g_middle: F64, steps: F64, curvature: F64, start: int,
     bounds: I64, key_origin: I64, used: int, table: I32, keys: I64, count: I64, cells: I32,

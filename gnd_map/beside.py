@@ -3,7 +3,7 @@
 import numpy as np
 
 from gnd.gnd_map.arrays import I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 
 
 def groups_of(index: I64, members: I64) -> list[I64]:
@@ -40,7 +40,7 @@ def group_numbers(x: I64, y: I64, floor: I64) -> I64:
     return np.array([_root(group, i) for i in range(n)])
 
 
-@kernel
+@bare
 def _root(group: I64, i: int) -> int:
     while group[i] != i:
         group[i] = group[group[i]]

@@ -4,13 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare
 
 UNKNOWN_COST = -1.0
 """Of a point where the map is not known, or at the edge of the window."""
 
 
-@kernel
+@bare
 def point_costs(
     points: F64,
     R: F64,

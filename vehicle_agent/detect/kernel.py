@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32
-from gnd.gnd_map.jit import kernel, pasted
+from gnd.gnd_map.jit import bare, pasted
 from gnd.vehicle_agent.detect.parameters import INCLUDED_M, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
@@ -227,7 +227,7 @@ def _index(g: float, n: int) -> int:
     return min(max(math.floor(g), 0), n - 1)
 
 
-@kernel
+@bare
 def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the voxel)
     points: F64,
     origins: F64,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 
 U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]
@@ -51,7 +51,7 @@ SAME_MPS: Final = 0.45
 """What travels along may come nearer or fall back as fast as this."""
 
 
-@kernel
+@bare
 def _column(x: float, y: float) -> int:
     """Column of a direction: its share of a turn measured along a square, which needs no arcus tangent."""
     size = abs(x) + abs(y)
@@ -106,7 +106,7 @@ def draw_sweep(points: F32, offset_ns: NDArray[np.uint32], reference_ns: int, T_
     return image, column_s
 
 
-@kernel
+@bare
 def _in_sweep(p: F64, column_s: F32, twist: F64, T_lidar_vehicle: F64, out: F64) -> int:
     """Where the LiDAR that turns saw a place `p` (3,) of the vehicle frame at the reference time: `out` (3,), LiDAR
     frame when it looked there; its column, or -1 where that is not known.
@@ -125,7 +125,7 @@ def _in_sweep(p: F64, column_s: F32, twist: F64, T_lidar_vehicle: F64, out: F64)
     return column
 
 
-@kernel
+@bare
 def _verdict(seen: int, range_m: float, below: bool) -> int:
     """Whether a ray ends before a place (`HIDDEN`), at it (`MET`) or well behind it (`PASSED`). Of a layer below the
     place, ground that is not before it shows that nothing stood in between.
@@ -138,7 +138,7 @@ def _verdict(seen: int, range_m: float, below: bool) -> int:
     return MET
 
 
-@kernel
+@bare
 def look(image: U16, column: int, row: int, range_m: float) -> int:
     """What the rays around a direction show of a place there: `PASSED` when the next ones above and below, in three
     columns, all end well behind it, `MET` when one ends there, else `UNKNOWN`.
@@ -163,7 +163,7 @@ def look(image: U16, column: int, row: int, range_m: float) -> int:
     return PASSED if above and below and not hidden else UNKNOWN
 
 
-@kernel
+@bare
 def _look_at(p: F64, image: U16, column_s: F32, twist: F64, T_lidar_vehicle: F64, at: F64) -> int:
     """Evidence of a sweep about a place (3,) in its vehicle frame; `at` is room for three numbers."""
     column = _in_sweep(p, column_s, twist, T_lidar_vehicle, at)
@@ -176,7 +176,7 @@ def _look_at(p: F64, image: U16, column_s: F32, twist: F64, T_lidar_vehicle: F64
     return look(image, column, row, math.sqrt(flat * flat + at[2] * at[2]))
 
 
-@kernel
+@bare
 def _nearest(image: U16, column: int, row: int, range_m: float) -> float:
     """The range in the 3 x 3 pixels around a direction that is nearest to `range_m`; infinite where no ray went."""
     best_m = np.inf
@@ -191,14 +191,14 @@ def _nearest(image: U16, column: int, row: int, range_m: float) -> float:
     return best_m
 
 
-@kernel
+@bare
 def _moved(T: F64, p: F64, out: F64) -> None:
     """`out` (3,) = T (4, 4) applied to p (3,)."""
     for a in range(3):
         out[a] = T[a, 0] * p[0] + T[a, 1] * p[1] + T[a, 2] * p[2] + T[a, 3]
 
 
-@kernel
+@bare
 def _under_the_vehicle(p: F64) -> bool:
     """True where the vehicle itself was: what lies there now was not there then."""
     return bool(LOW_M[0] < p[0] < HIGH_M[0] and LOW_M[1] < p[1] < HIGH_M[1] and LOW_M[2] < p[2] < HIGH_M[2])
@@ -304,11 +304,11 @@ def grown(points: F64, stays: U8, passed: U8, met: U8) -> NDArray[np.bool_]:
     return result
 
 
-@kernel
+@bare
 def _is_seed(passed: int, met: int) -> bool:
     return passed >= MIN_PASSED and met <= passed
 
 
-@kernel
+@bare
 def _is_static(passed: int, met: int) -> bool:
     return passed == 0 and met >= MIN_MET

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I32
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.match_map import MatchMap
@@ -264,7 +264,7 @@ def _field(index: I32) -> U8:
     return field
 
 
-@kernel
+@bare
 def _mark(index: I32, field: U8) -> None:
     """Fill `field`, which is 0, by `index` (nx, ny, nz): see `_field`."""
     nx, ny, nz = index.shape
@@ -282,7 +282,7 @@ def _mark(index: I32, field: U8) -> None:
                         field[i, j, h] = NEXT_TO
 
 
-@kernel
+@bare
 def _score_all(points: F64, R: F64, t: F64, field: U8, scores: F64) -> None:
     """Mean of `field` over the points (N, 3) under each transform R (K, 3, 3), t (K, 3) into window coordinates."""
     nx, ny, nz = field.shape

@@ -3,14 +3,14 @@
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I32
-from gnd.gnd_map.jit import inlined, kernel
+from gnd.gnd_map.jit import bare, bare_inlined, kernel
 
 JACOBI_SWEEPS = 6  # a symmetric 3x3 matrix is diagonal to 1e-15 after five
 MOST_SWEEPS = 30  # of larger ones, which stop when they are diagonal: after six or seven
 LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
 
-@inlined
+@bare_inlined
 def _rotation(S: F64, p: int, q: int) -> tuple[float, float, float]:
     """Tangent, cosine and sine of the turn of the symmetric S (n, n) after which S[p, q], not 0 now, is 0."""
     theta = 0.5 * (S[q, q] - S[p, p]) / S[p, q]
@@ -19,7 +19,7 @@ def _rotation(S: F64, p: int, q: int) -> tuple[float, float, float]:
     return t, c, t * c
 
 
-@kernel
+@bare
 def _jacobi_rotate(S: F64, V: F64, p: int, q: int) -> None:
     """Turn the symmetric S (3, 3) so that S[p, q] becomes 0, and the columns of V with it."""
     if S[p, q] == 0.0:
@@ -63,14 +63,14 @@ def tapered_information(cov: F64, noise_m2: float, uniform_m2: float, informatio
             information[m, 5] += i * z * z
 
 
-@inlined
+@bare_inlined
 def _mahalanobis2(o: F64, d0: float, d1: float, d2: float) -> float:
     """Squared distance d' Omega d with Omega as upper triangle (6,)."""
     mixed = o[1] * d0 * d1 + o[2] * d0 * d2 + o[4] * d1 * d2
     return float(o[0] * d0 * d0 + o[3] * d1 * d1 + o[5] * d2 * d2 + 2.0 * mixed)
 
 
-@inlined
+@bare_inlined
 def _nearest(
     q0: float, q1: float, q2: float, cell: int, ny: int, nz: int, flat: I32, mean: F64, omega: F64, gate_m2: float
 ) -> tuple[int, float]:
@@ -85,7 +85,7 @@ def _nearest(
     return best, best_m2
 
 
-@inlined
+@bare_inlined
 def _known_cell(q0: float, q1: float, q2: float, nx: int, ny: int, nz: int, flat: I32, A: F64, b: F64) -> int:
     """Number of the cell of the window (nx, ny, nz), `flat`, that a map point lies in; -1 at its edge, outside, and in
     tiles not held.
@@ -99,7 +99,7 @@ def _known_cell(q0: float, q1: float, q2: float, nx: int, ny: int, nz: int, flat
     return -1 if flat[cell] < -1 else cell
 
 
-@kernel
+@bare
 def linearise(
     points: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale2: float, gate_m2: float,
     H: F64, g: F64,
@@ -193,7 +193,7 @@ def linearise(
     return cost, matched, inside
 
 
-@kernel
+@bare
 def point_fits(
     points: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale2: float, gate_m2: float,
     fits: F64,
@@ -215,7 +215,7 @@ def point_fits(
             fits[n] = scale2 / (scale2 + m2)
 
 
-@kernel
+@bare
 def pulls(
     points: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale2: float, gate_m2: float,
     along: F64, pull: F64, weight: F64,
@@ -256,7 +256,7 @@ def pulls(
             weight[row, k] += s * s * _mahalanobis2(o, u0, u1, u2)
 
 
-@kernel
+@bare
 def cholesky(S: F64, least: float, L: F64) -> bool:
     """Fill L (6, 6) with the lower factor of S - `least` I, S symmetric; False where that is not positive definite, so
     that not all eigenvalues of S are above `least`.
@@ -275,7 +275,7 @@ def cholesky(S: F64, least: float, L: F64) -> bool:
     return True
 
 
-@kernel
+@bare
 def _rotate(S: F64, V: F64, p: int, q: int) -> None:
     """Turn the symmetric S (n, n) so that S[p, q] becomes 0, and the columns of V with it."""
     if S[p, q] == 0.0:
@@ -288,7 +288,7 @@ def _rotate(S: F64, V: F64, p: int, q: int) -> None:
         S[p, r], S[q, r] = c * S[p, r] - s * S[q, r], s * S[p, r] + c * S[q, r]
 
 
-@kernel
+@bare
 def principal(S: F64, V: F64) -> None:
     """Make the symmetric S (n, n) diagonal; the columns of V (n, n) become its eigenvectors (cyclic Jacobi)."""
     V[:] = 0.0
@@ -307,7 +307,7 @@ def principal(S: F64, V: F64) -> None:
                 _rotate(S, V, p, q)
 
 
-@kernel
+@bare
 def by_levers(H: F64, S: F64) -> None:
     """Fill S (6, 6) with H, turns measured as motion at `LEVER_M`."""
     for r in range(6):
@@ -315,7 +315,7 @@ def by_levers(H: F64, S: F64) -> None:
             S[r, c] = H[r, c] / ((LEVER_M if r < 3 else 1.0) * (LEVER_M if c < 3 else 1.0))
 
 
-@kernel
+@bare
 def _substitute(L: F64, x: F64) -> None:
     """Divide x (6,) by L L', L (6, 6) a lower triangle."""
     for r in range(6):
@@ -350,7 +350,7 @@ def newton_step(H: F64, g: F64, least: float, step: F64) -> None:
         step[r] /= LEVER_M
 
 
-@kernel
+@bare
 def _turned(step: F64, R: F64) -> None:
     """R (3, 3) becomes exp(step[:3]) R."""
     x, y, z = step[0], step[1], step[2]

@@ -6,7 +6,7 @@ The plain twins are in `tests/localise/test_odometry_kernels.py`.
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 
 
 @kernel
@@ -37,7 +37,7 @@ def resampled(known_ns: I64, speed: F64, yaw_rate: F64, first_ns: int, last_ns: 
     return t[:n], speed_at, yaw_rate_at
 
 
-@kernel
+@bare
 def integrate(t_ns: I64, speed: F64, yaw_rate: F64, course: F64, T: F64) -> None:
     """Fill T (N, 4, 4) with the poses at times (N,) in the frame of the first, of a car that drives along its x axis
     and turns about z, step by step along the chord of an arc; course (2,): motion left and up per metre forward.

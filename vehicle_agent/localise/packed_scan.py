@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.schemas.drive import Scan
@@ -78,7 +78,7 @@ def pack(scan: Scan) -> PackedScan:
     return PackedScan(scan.t_ns, end_ns, points, ticks, step_m, tick_ns)
 
 
-@kernel
+@bare
 def survey(points: NDArray[np.float32]) -> tuple[int, float]:
     """How many points (N, 3) are finite, and their largest coordinate."""
     kept, reach = 0, 0.0
@@ -90,7 +90,7 @@ def survey(points: NDArray[np.float32]) -> tuple[int, float]:
     return kept, reach
 
 
-@kernel
+@bare
 def squeeze(
     raw: NDArray[np.float32], offset_ns: NDArray[np.uint32], per_m: float, tick_ns: int,
     points: NDArray[np.int16], ticks: NDArray[np.uint16],

@@ -6,7 +6,7 @@
 import numpy as np
 
 from gnd.gnd_map.arrays import BOOL, F64, I32
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 from gnd.vehicle_agent.localise.kernels import LEVER_M, by_levers, descend, linearise, principal, stand, without_hints
 
 FREE_M2 = 100.0
@@ -120,7 +120,7 @@ def taken_back(t: F64, t_start: F64, least: float, values: F64, vectors: F64, st
     return any_weak
 
 
-@kernel
+@bare
 def covariance_of(
     values: F64, vectors: F64, strong: BOOL, correlation: float, floor_rad: float, floor_m: float, covariance: F64
 ) -> None:

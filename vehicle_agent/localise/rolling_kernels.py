@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I32, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 
 U64 = NDArray[np.uint64]
 
@@ -80,7 +80,7 @@ def add_points(
     return used, n_touched
 
 
-@kernel
+@bare
 def _bits(mask: np.uint64) -> int:
     n = 0
     while mask:
@@ -89,7 +89,7 @@ def _bits(mask: np.uint64) -> int:
     return n
 
 
-@kernel
+@bare
 def refresh(
     rows: I64, per_m: float, origin: I64, min_cells: int, line_ratio: float, upright: float, voxel: I32, mask: U64,
     sums: F64, index: I32, mean: F64, cov: F64,

@@ -7,13 +7,13 @@ twins are in `tests/localise/test_stretch_kernels.py`.
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I32, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 from gnd.vehicle_agent.localise.register_kernels import linearise_pose
 
 SHARED = 4
 
 
-@kernel
+@bare
 def _log(R: F64, vector: F64) -> None:
     """Fill `vector` (3,) with the rotation vector of R (3, 3). Of a half-turn, which no step is, only the length is
     right: nothing fits there, and must not seem to.
@@ -28,7 +28,7 @@ def _log(R: F64, vector: F64) -> None:
     vector[0], vector[1], vector[2] = per * x, per * y, per * z
 
 
-@kernel
+@bare
 def motion(T_from: F64, T_to: F64, R: F64, off: F64) -> None:
     """Fill R (3, 3) and off[3:] with T_from^-1 T_to, and off[:3] with its rotation vector."""
     for r in range(3):
@@ -119,7 +119,7 @@ def add_steps(first: I32, information: F64, e: F64, J: F64, weight: F64, A: F64,
                     A[at, to] += weighted[i, r] * J[m, r, j]
 
 
-@kernel
+@bare
 def add_matches(knot: I32, off: F64, weight: F64, H: F64, slope: F64, A: F64, g: F64) -> None:
     """Add the matches of the scans `knot` (M,) with the map: H (M, 6, 6) and slope (M, 6) where they were made, `off`
     (M, 6) how far the poses have moved since, `weight` (M,) of each.
@@ -134,7 +134,7 @@ def add_matches(knot: I32, off: F64, weight: F64, H: F64, slope: F64, A: F64, g:
             g[at + r] += weight[m] * pull
 
 
-@kernel
+@bare
 def solve(A: F64, g: F64, L: F64, x: F64) -> bool:
     """Fill x (n,) with A^-1 g by a Cholesky factor L (n, n), filled, that keeps to where A (n, n) has entries: poses
     know their neighbours and what all share. False where A is not positive definite; x is undefined then.

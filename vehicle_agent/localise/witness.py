@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I32, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 from gnd.vehicle_agent.localise.initialise import STANDING_ABOVE_M
 from gnd.vehicle_agent.localise.match_map import MatchMap
 
@@ -107,14 +107,14 @@ def witnessed(
     return Testimony(counts, int(standing.sum()), _LEAST_POINTS)
 
 
-@kernel
+@bare
 def _mahalanobis2(o: F64, d0: float, d1: float, d2: float) -> float:
     """Squared distance d' Omega d with Omega as upper triangle (6,)."""
     mixed = o[1] * d0 * d1 + o[2] * d0 * d2 + o[4] * d1 * d2
     return float(o[0] * d0 * d0 + o[3] * d1 * d1 + o[5] * d2 * d2 + 2.0 * mixed)
 
 
-@kernel
+@bare
 def _nearest2(q: F64, ix: int, iy: int, iz: int, index: I32, mean: F64, omega: F64) -> float:
     """Least squared Mahalanobis distance to a Gaussian of the 27 voxels around, 1e9 if there is none."""
     best = 1e9
@@ -129,7 +129,7 @@ def _nearest2(q: F64, ix: int, iy: int, iz: int, index: I32, mean: F64, omega: F
     return best
 
 
-@kernel
+@bare
 def _crossing(o: F64, u: F64, mean: F64, omega: F64, least: float) -> float:
     """Way along the ray from `o` (3,) in direction `u` (3,) to where it is nearest to a Gaussian in its own measure, if
     the ray goes through it rather than along it (information along the ray at least `least`), else -1.
@@ -147,7 +147,7 @@ def _crossing(o: F64, u: F64, mean: F64, omega: F64, least: float) -> float:
     return s if _mahalanobis2(omega, e0, e1, e2) < 1.0 else -1.0
 
 
-@kernel
+@bare
 def _walk(
     o: F64, u: F64, way_m: float, behind_m: float, least: float, index: I32, A: F64, b: F64, mean: F64, omega: F64,
     count: I64,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gnd.gnd_map.arrays import F32, F64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 
 PIT_M = 0.3
 REACH_CELLS = 5
@@ -48,7 +48,7 @@ def lowest_heights(points: F32, grid: GroundGrid, near_m: float) -> F32:
     return second
 
 
-@kernel
+@bare
 def remember_ground(memory: F32, now: F32, step_m: float) -> None:
     """Bring what is seen now into `memory` (nx, ny), changed: quickly where it is lower, slowly where it is higher.
 
@@ -69,7 +69,7 @@ def remember_ground(memory: F32, now: F32, step_m: float) -> None:
                 memory[i, j] += np.float32(0.2) * change
 
 
-@kernel
+@bare
 def _is_pit(memory: F32, i: int, j: int) -> bool:
     """Whether three quarters of the neighbours that are known lie much higher: an echo below the ground."""
     known, higher = 0, 0

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW
 
 U16 = NDArray[np.uint16]
@@ -42,7 +42,7 @@ class RangeJudge(NamedTuple):
     """Weight of "static" votes, none against them, after which a point is asked about no more."""
 
 
-@kernel
+@bare
 def _turn(y: float, x: float) -> float:
     """atan2(y, x) as a share of a full turn, 0 ... 1, to 1e-6 (Hastings' polynomial of degree 11)."""
     a, b = abs(x), abs(y)
@@ -62,7 +62,7 @@ def _turn(y: float, x: float) -> float:
     return turn + 1.0 if turn < 0.0 else turn
 
 
-@kernel
+@bare
 def elevation_span(points: F32, origins: F32, R: F64) -> tuple[float, float]:
     """Lowest and highest tangent of elevation of the rays."""
     low, high = np.inf, -np.inf
@@ -140,7 +140,7 @@ def layer_gap(image: U16, share: float) -> int:
     return max(gap, 1)
 
 
-@kernel
+@bare
 def _look(
     image: U16, column: int, across: int, low: int, high: int, near_cm: float, far_cm: float
 ) -> tuple[bool, bool, bool]:
@@ -167,7 +167,7 @@ def _look(
     return beyond, nearer, same
 
 
-@kernel
+@bare
 def vote(  # noqa: C901  (one loop over the window)
     points: F32,
     offset_m: F64,

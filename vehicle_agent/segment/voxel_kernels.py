@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, I32, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid
 
 U8 = NDArray[np.uint8]
@@ -17,12 +17,12 @@ _LIMIT = 1 << 20
 _HASH = np.uint64(0x9E3779B97F4A7C15)
 
 
-@kernel
+@bare
 def _key(i: int, j: int, k: int) -> int:
     return ((i + _LIMIT) << 42) | ((j + _LIMIT) << 21) | (k + _LIMIT)
 
 
-@kernel
+@bare
 def _slot(keys: I64, key: int) -> int:
     """Where `key` is in the table, or the empty place where it belongs."""
     mask = np.uint64(len(keys) - 1)
@@ -85,7 +85,7 @@ def find_objects(
     return voxel_of, first[:count].copy(), index[:count].copy()
 
 
-@kernel
+@bare
 def _root(parent: I32, n: int) -> int:
     while parent[n] != n:
         parent[n] = parent[parent[n]]
@@ -93,7 +93,7 @@ def _root(parent: I32, n: int) -> int:
     return n
 
 
-@kernel
+@bare
 def _join(parent: I32, a: int, b: int) -> None:
     """The root with the smaller number stays."""
     a, b = _root(parent, a), _root(parent, b)
@@ -101,7 +101,7 @@ def _join(parent: I32, a: int, b: int) -> None:
         parent[max(a, b)] = min(a, b)
 
 
-@kernel
+@bare
 def _join_above(index: I32, n: int, reach: int, keys: I64, values: I32, parent: I32) -> None:
     """Join voxel `n` with the nine above it, else with the next one straight above: layers leave gaps."""
     found = False

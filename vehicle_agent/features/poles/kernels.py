@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 
 U8 = NDArray[np.uint8]
 
@@ -190,7 +190,7 @@ def thin_slices(polar: F64, order: I64, start: I64, step: float, beside: Beside)
     return members[:filled].copy(), begin[: slices + 1].copy(), sides[:slices].copy()
 
 
-@kernel
+@bare
 def _widest_gap(rays: I64, polar: F64) -> int:
     """Where to begin a row, so that nothing lies across its ends: after its widest gap."""
     n, widest, at = rays.shape[0], -1.0, 0
@@ -201,13 +201,13 @@ def _widest_gap(rays: I64, polar: F64) -> int:
     return at
 
 
-@kernel
+@bare
 def _turn(angle: float) -> float:
     """A difference of azimuths as 0 … 2 pi."""
     return angle if angle >= 0.0 else angle + 2.0 * math.pi
 
 
-@kernel
+@bare
 def _linked(before: int, after: int, polar: F64, step: float, beside: Beside) -> bool:
     gap = _turn(polar[after, 0] - polar[before, 0])
     near = min(polar[before, 1], polar[after, 1])
@@ -215,7 +215,7 @@ def _linked(before: int, after: int, polar: F64, step: float, beside: Beside) ->
     return bool(apart < beside.link_m and gap * near < max(beside.link_m, 2.5 * step * near))
 
 
-@kernel
+@bare
 def _is_thin(rays: I64, a: int, b: int, polar: F64, step: float, width_m: float) -> bool:
     """Whether the rays a … b - 1 of a row span no more than a pole does, across and along."""
     n = rays.shape[0]
@@ -228,7 +228,7 @@ def _is_thin(rays: I64, a: int, b: int, polar: F64, step: float, width_m: float)
     return bool(high - low < width_m)
 
 
-@kernel
+@bare
 def _beside(rays: I64, edge: int, way: int, polar: F64, step: float, beside: Beside) -> int:
     """What lies within `clear_m` beside the ray at `edge`, to the right (way -1) or left (1)."""
     n = rays.shape[0]
@@ -246,7 +246,7 @@ def _beside(rays: I64, edge: int, way: int, polar: F64, step: float, beside: Bes
     return JOINED if _on_a_line(rays, edge, way, polar, step) else found
 
 
-@kernel
+@bare
 def _on_a_line(rays: I64, edge: int, way: int, polar: F64, step: float) -> bool:
     """Whether the ray and the next two lie on a straight line in plan: the near end of a wall seen from along it.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 
 
 class GroundCells(NamedTuple):
@@ -155,7 +155,7 @@ def around(
     return count, sums
 
 
-@kernel
+@bare
 def _cells(middle_m: float, far_m: float, ground: GroundCells) -> tuple[int, int]:
     """First cell, and the one after the last, along an axis of the grid, within `far_m` of its coordinate."""
     first = min(max(math.floor((middle_m - far_m) / ground.cell_m), 0), ground.n)
