@@ -248,7 +248,7 @@ class Pipeline(Generic[TilesT]):
             if self.change is not None:
                 for scan in self.change.segmenter.push(refined):  # rays against rays of other scans -> which move
                     self.change.detect(scan)  # rays + tiles -> evidence and new Gaussians
-                    self.change.report(scan, self.place.odometer_m)  # tiles left behind -> classes -> reports
+                    self.change.report(scan, self.place.odometer_m, busy=self._busy)  # tiles left -> classes -> reports
                     self._judge(scan)  # observations + feature tiles -> what exists, is gone, is new -> reports
         self._note(item)
         if self.surveyor is not None:
@@ -330,6 +330,11 @@ class Pipeline(Generic[TilesT]):
             "calibration": localiser.calibration.as_json(),
             "surveys": {} if self.surveyor is None else self.surveyor.account(),
         }
+
+    @property
+    def _busy(self) -> bool:
+        """The newest scan took long already."""
+        return isinstance(self.localisation, Localiser) and self.localisation.busy
 
     def _follow(self) -> None:
         self.tiles.follow(self.place)
@@ -419,9 +424,9 @@ class ChangeDetection:
             watch(scan)
         self.reporter.add_scan(scan)
 
-    def report(self, scan: SegmentedScan, odometer_m: float) -> None:
+    def report(self, scan: SegmentedScan, odometer_m: float, *, busy: bool) -> None:
         """Decide the tiles that this scan's pose has left behind; what has waited long enough is reported."""
-        self.reporter.leave_behind(scan.scan.estimate, odometer_m)
+        self.reporter.leave_behind(scan.scan.estimate, odometer_m, busy=busy)
 
 
 def known_course(known: MotionCalibration) -> Course | None:

@@ -13,7 +13,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.detect.classify import classify
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.parameters import MEASURED_RULES, DetectParameters
-from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError, poses_step
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 

@@ -90,8 +90,9 @@ class ChangeDetector:
         affine = self.local_map.grid_frame.affine(middle)
         A, b = window_affine(*affine, window.anchor_m, window.origin_g)
         kept = np.zeros(len(points), np.uint8)
+        ends, starts = self._about(points, window.anchor_m, 0), self._about(origins, window.anchor_m, 1)
         cast = cast_rays(
-            self._about(points, window.anchor_m, 0), self._about(origins, window.anchor_m, 1), A, b, window.state.reshape(-1), window.state.shape,
+            ends, starts, A, b, window.state.reshape(-1), window.state.shape,
             window.records.words, window.records.floats, window.records.block,
             kernel_parameters(self.parameters, pose), moves, kept,
         )  # fmt: skip

@@ -150,6 +150,11 @@ class Localiser:
         return ("lost", self._first.cause) if self.online is None else (self.online.health, self.online.cause)
 
     @property
+    def busy(self) -> bool:
+        """True when the newest scan took long to localise: what can wait is better done with the next one."""
+        return self._track is not None and self._track.busy
+
+    @property
     def drive(self) -> DriveState:
         """What outlives a track: the sensors as learnt."""
         return self._drive

@@ -106,7 +106,7 @@ class Refiner:
         self._belief: StretchBelief | None = None
         self._solved: SolvedStretch | None = None
         self._solved_way_m, self._solved_ns = 0.0, 0
-        self._news = False
+        self._news = self._waited = False
         self._solutions = 0
         self._noise = StepNoise()
         self._firm = 0  # solutions in a row that fitted well
@@ -119,6 +119,8 @@ class Refiner:
         T_map_vehicle: F64,
         T_before_now: F64 | None = None,
         seen: ScanStep | None = None,
+        *,
+        busy: bool = False,
     ) -> list[SmoothedPose]:
         """Take a scan; give the poses that became final with it.
 
@@ -129,23 +131,32 @@ class Refiner:
             T_map_vehicle: (4, 4) its online pose.
             T_before_now: (4, 4) motion since the scan before as all odometry tells it; None: wheels and gyro alone.
             seen: that motion as the scans tell it.
+            busy: something else that takes long was done with this scan: what is due is solved with the next one.
         """
-        self._news = False
+        self._news, waits = False, busy and not self._waited
         newest, par = self._scans.take(number, t_ns, points_m, T_map_vehicle, T_before_now, seen), self.parameters
         if self._belief is None:
             self._belief = self._first_belief(T_map_vehicle)
             self._solved_way_m, self._solved_ns = newest.way_m, t_ns
         due = newest.way_m - self._solved_way_m >= par.every_m or t_ns - self._solved_ns >= _EVERY_S * 1e9
-        if newest.knot is not None and due:
-            self._solve()
-            return self._leaving(newest)
-        return []
+        if newest.knot is None or not due:
+            return []
+        self._waited = waits
+        if waits:
+            return []
+        self._solve()
+        return self._leaving(newest)
 
     def flush(self) -> list[SmoothedPose]:
         """All poses that are not final yet, as they stand."""
         if self._final < len(self._scans):
             self._solve()
         return self._finalise(len(self._scans))
+
+    @property
+    def solved(self) -> bool:
+        """True when the stretch was solved with the newest scan."""
+        return self._news
 
     @property
     def supported(self) -> bool:

@@ -160,6 +160,11 @@ class TrackedPose:
             final = self._refine(self._refiner, scan, points, step.joint.T_before_now, step.seen)
         return self._taken(final)
 
+    @property
+    def busy(self) -> bool:
+        """True when the newest scan took long: the pose was compared with others, or the stretch solved."""
+        return self.judge.uniqueness.tested or (self._refiner is not None and self._refiner.solved)
+
     def flush(self) -> list[FinalScan]:
         """Return the scans that are held, with their poses as they stand."""
         return self._taken(self.graph.flush() if self._refiner is None else self._refiner.flush())
@@ -304,7 +309,9 @@ class TrackedPose:
         number, monitor = self.graph.newest, self.judge.monitor
         T_online = self.graph.pose(number)
         refiner.unique = monitor.unique
-        final = refiner.push(number, scan.t_ns, points_m, T_online, T_before_now, seen)
+        final = refiner.push(
+            number, scan.t_ns, points_m, T_online, T_before_now, seen, busy=self.judge.uniqueness.tested
+        )
         monitor.certain = refiner.certain and not self.judge.uniqueness.beaten
         correction = refiner.correction(T_online)
         if correction is not None:

@@ -171,6 +171,8 @@ class Uniqueness:
         self.proven = not par.enabled
         self.margin = 0.0
         """Sigmas by which the tracked pose was ahead of the best other one at the last test."""
+        self.tested = False
+        """Whether the newest scan was."""
         self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
         self._beaten = self._ahead = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
@@ -203,13 +205,14 @@ class Uniqueness:
             match_map: the map window.
             believed: whether the scan's match is; what is not matched is not compared.
         """
+        self.tested = False
         if not self._par.enabled:
             return
         self._view.push(standing_m, T_before_now, T_tracked)
         if place is not None:
             self._view.see_position(place.p_map_m, place.reach_m)
         if believed and self._view.way_m >= self._next_m:
-            self._tested_m = self._view.way_m
+            self._tested_m, self.tested = self._view.way_m, True
             self.margin = self._tested(T_tracked, match_map)
             self._conclude()
 

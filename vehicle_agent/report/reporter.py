@@ -202,6 +202,7 @@ class Reporter:
         self._doubts = TileDoubts(detector.local_map.grid_frame)
         self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
         self._shifted = 0
+        self._waited = False  # to decide and report, for a scan
 
     def add_scan(self, segmented: SegmentedScan) -> None:
         """Count the scan's rays, if its pose is good enough for evidence and has stood the shift test."""
@@ -270,8 +271,13 @@ class Reporter:
         self._lengthen(scan.t_ns)
         self._tracks.add_scan(scan)
 
-    def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
-        """Decide the tiles that the refined pose has left, and report what has waited long enough."""
+    def leave_behind(self, estimate: PoseEstimate, odometer_m: float, *, busy: bool = False) -> None:
+        """Decide the tiles that the refined pose has left, and report what has waited long enough; with the next scan,
+        if the vehicle is busy with something else that takes long.
+        """
+        self._waited = busy and not self._waited
+        if self._waited:
+            return
         self._here_ns = estimate.t_ns
         self._decide_left(estimate, odometer_m)
         for district, pending in list(self._pending.items()):
