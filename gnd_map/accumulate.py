@@ -251,7 +251,7 @@ def _accumulate_marked(
 
 
 @bare_inlined
-def _key_of(x: float, y: float, z: float, bounds: I64, key_origin: I64) -> int:
+def _key_of(x: float, y: float, z: float, bounds: I64, key_origin: I64) -> np.int64:
     """Key of the voxel of grid coordinates; -1 outside `bounds` (2, 3)."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     if (
@@ -260,7 +260,7 @@ def _key_of(x: float, y: float, z: float, bounds: I64, key_origin: I64) -> int:
     ):  # fmt: skip
         return np.int64(-1)
     kx, ky, kz = np.int64(fx) - key_origin[0], np.int64(fy) - key_origin[1], np.int64(fz) - key_origin[2]
-    return (kx << 42) | (ky << 21) | kz
+    return np.int64((kx << 42) | (ky << 21) | kz)
 
 
 @bare_inlined

@@ -75,6 +75,7 @@ class Bench:
     waiting_s: list[float] = field(default_factory=list)  # age of the oldest scan that is not final, after each push
     learnt: list[bool] = field(default_factory=list)
     final: list[SmoothedPose] = field(default_factory=list)
+    busy: bool = False
 
     def drive(self, n, first=0, online_m=0.05, online_deg=0.3):
         """Push scans `first` ... `first + n`, online poses off by so much."""
@@ -83,7 +84,8 @@ class Bench:
                 self.motion.push(sample.t_ns, sample.speed_mps, sample.yaw_rate_radps)
             rng, T = np.random.default_rng(k), self.where(k * EVERY_NS)
             points = seen_from(rng, self.surfaces[k % 7 :: 7], T, 1500)
-            self.final += self.refiner.push(k, k * EVERY_NS, points, moved(rng, T, online_m, online_deg))
+            T_online = moved(rng, T, online_m, online_deg)
+            self.final += self.refiner.push(k, k * EVERY_NS, points, T_online, busy=self.busy)
             self.waiting_s.append((k - (self.final[-1].number + 1 if self.final else 0)) * EVERY_NS / S)
             self.learnt.append(self.teacher.uncertainty[1] < np.radians(REFINE_LEARNT_DEGPS))
         return self
@@ -179,6 +181,22 @@ def test_a_scan_is_not_final_before_what_comes_after_it_is_matched(bench):
     run = bench(par).drive(90)
     behind_m = (89 - run.final[-1].number) * SPEED_MPS * EVERY_NS / S
     assert par.lag_m - 0.51 <= behind_m <= par.lag_m + 2 * par.every_m
+
+
+def test_while_something_else_takes_long_a_stretch_is_solved_with_the_next_scan(bench):
+    """Once, not as long as it takes."""
+    runs = [bench().drive(40) for _ in range(2)]
+    solved = [[], []]
+    for k in range(40, 70):
+        for run, busy, found in zip(runs, (False, True), solved, strict=True):
+            run.busy = busy
+            run.drive(1, first=k)
+            found.append(run.refiner.solved)
+    at, later = (np.flatnonzero(found) for found in solved)
+    assert len(at) > 4
+    assert abs(len(at) - len(later)) <= 2
+    assert 0 < later[0] - at[0] <= 3  # with the next knot
+    assert np.abs(runs[1].errors()[:, :2]).max() < 0.05
 
 
 def test_a_standing_vehicle_does_not_wait_for_way(bench):
@@ -289,6 +307,7 @@ class Drive:
     surfaces: np.ndarray
     final: list = field(default_factory=list)
     online_m: list[float] = field(default_factory=list)  # horizontal error after each scan
+    most: int = 0  # scans that came out with one
 
     def on(self, first, last, slip_mps=0.0):
         """Push scans `first` to before `last`, the wheels turning too fast."""
@@ -300,7 +319,9 @@ class Drive:
                 self.localiser.push_gnss(fix_at(T, t_ns))
             seen = seen_from(np.random.default_rng(k), self.surfaces[k % 5 :: 5], T @ MOUNT, 1500, 15.0)
             scan = Scan(t_ns, seen.astype(np.float32), np.zeros(len(seen), np.uint32))
-            self.final += self.localiser.take_scan(scan)
+            came = list(self.localiser.take_scan(scan))
+            self.most = max(self.most, len(came))
+            self.final += came
             if self.localiser.online is not None:
                 self.online_m.append(horizontal_m(self.localiser.online))
         return self
@@ -345,6 +366,7 @@ def test_a_drive_gives_every_scan_once(yard_map, yard_points):
     assert times == sorted(set(times))
     assert len(times) == 60 - run.localiser.dropped_scans
     assert times[-1] == 69 * EVERY_NS
+    assert run.most <= 5  # although some thirty become final at once when the first stretch is learnt
 
 
 def test_wheels_that_slip_bend_the_stretch_for_a_moment_only(yard_map, yard_points):

@@ -128,6 +128,21 @@ def test_only_tiles_left_behind_are_decided(
     assert drive.counts["reports"] == len(reports(outbox))
 
 
+def test_tiles_left_at_once_are_decided_scan_by_scan_and_later_while_the_vehicle_is_busy(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "VOXELS_AT_ONCE", 1)
+    drive, decided = reporter(tiles, outbox, **PATIENT), [0]
+    drive.add_scan(scan(hits))
+    for busy in [True, False] * (len(tiles) + 2):
+        drive.leave_behind(estimate(x_m=200.0), 200.0, busy=busy)
+        decided.append(sum(drive.classes.values()))
+    steps = np.diff(decided)
+    assert not steps[::2].any()  # those in which it was busy
+    assert (steps > 0).sum() == len(tiles)
+    assert sorted(c.tile for r in reports(outbox) for c in r.tiles) == sorted(tiles)
+
+
 def changed_in(found: list[ChangeReport]) -> int:
     return sum(len(c.changed) for r in found for c in r.tiles)
 

@@ -87,9 +87,9 @@ class TileUncertainties:
         A, b = affine
         morton, _ = self._grid_frame.tile_voxel_of(np.floor(some @ A.T + b).astype(np.int64))
         codes, member = np.unique(morton, return_inverse=True)
-        n = np.bincount(member).astype(np.float64)
+        points = np.bincount(member).astype(np.float64)
         range_m2 = np.bincount(member, weights=((some - origin_map_m) ** 2).sum(axis=1))
-        rows = np.column_stack([n, n * pose.sigma_m**2, n * pose.sigma_rad**2, range_m2]) * step
+        rows = np.column_stack([points, points * pose.sigma_m**2, points * pose.sigma_rad**2, range_m2]) * step
         for code, row in zip(codes.tolist(), rows, strict=True):
             self._sums[code] = self._sums.get(code, np.zeros(4)) + row
 

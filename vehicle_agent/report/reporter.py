@@ -50,6 +50,7 @@ from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from gnd.vehicle_agent.surroundings import left_behind
 from gnd.vehicle_agent.tracks import Tracks
 
+VOXELS_AT_ONCE = 2500  # tiles are decided with one scan until they have so many voxels: in town one or two
 STEP_M = 2.0  # tiles left behind are looked for after this much way
 _LEAVE_M: Final = 4.0
 """A tile this much farther away than detection reaches gets no more evidence: its classes are decided. It holds how far
@@ -296,11 +297,21 @@ class Reporter:
         self._tracks.touched(touched)
         open_tiles = set(touched) | set(self._doubts.tiles())
         left = left_behind(frame, open_tiles, p_map, self._left_behind_m)
-        if len(left) > 1:  # the rest with the next scans: several at once would make the vehicle late
-            left, self._looked_at = sorted(left)[:1], None
+        now = self._few_of(left)
+        if len(now) < len(left):
+            left, self._looked_at = now, None  # the rest with the next scans
         self._decide(left, odometer_m)
         self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._left_behind_m))
         self._open_districts = {t.district for t in open_tiles - set(left)}
+
+    def _few_of(self, left: Collection[TileId]) -> tuple[TileId, ...]:
+        """The first of the tiles that were left: one, or more of small ones; many at once would make a vehicle late."""
+        ordered, voxels, n = sorted(left), 0, 0
+        while n < len(ordered) and (n == 0 or voxels < VOXELS_AT_ONCE):
+            tile = self._detector.local_map.tile(ordered[n])
+            voxels += 0 if tile is None else len(tile.gaussians)
+            n += 1
+        return tuple(ordered[:n])
 
     def report_all(self, odometer_m: float) -> None:
         """The drive has ended: decide and report everything."""
