@@ -21,11 +21,21 @@ from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.trial import Trial
 from gnd.vehicle_agent.features.poles.detector import PoleDetector
 from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.co_moving import LEAST_SWEEPS, CoMoving
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.localiser import Localiser
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import NOISE_M, RegistrationParameters
+from gnd.vehicle_agent.localise.registration import settle
 from gnd.vehicle_agent.localise.rolling_map import ROLLING_MOVE_M, RollingMap
+from gnd.vehicle_agent.localise.stretch import (
+    N_SHARED,
+    Knot,
+    StretchBelief,
+    StretchStep,
+    marginalised,
+    solve_stretch,
+)
 from gnd.vehicle_agent.report.packing import pack, pack_measured
 from gnd.vehicle_agent.report.reporter import on_lattice
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
@@ -49,6 +59,8 @@ def warm_up() -> None:
         detector.add_scan(scan.points_map_m, scan.origins_map_m)
     _try(local_map, refined)
     _rolled(points)
+    _stretched(local_map, points)
+    _beside_others(points)
     _segment(points, refined[-1].estimate if refined else None)
     _find_poles(points)
     detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
@@ -83,6 +95,28 @@ def _rolled(points_m: F64) -> None:
     rolling = RollingMap(NOISE_M)
     for x_m in (0.0, 2.0 * ROLLING_MOVE_M):
         rolling.add(points_m, np.array([x_m, 0.0, 0.0]))
+
+
+def _stretched(local_map: LocalMap, points_m: F64) -> None:
+    """Solve a stretch, let go of its first scans, stand on wheels alone: no vehicle that stands comes so far."""
+    knots = [Knot(points_m, np.eye(4), 1.0) for _ in range(3)]
+    steps = [[StretchStep(np.eye(4), np.eye(6), np.zeros((6, N_SHARED)))]] * 2
+    belief = StretchBelief(np.eye(4), np.zeros(N_SHARED), np.eye(6 + N_SHARED), np.zeros(6 + N_SHARED))
+    match_map, registration = MatchMapCache(local_map, NOISE_M).near(np.zeros(3)), RegistrationParameters()
+    solve_stretch(knots, steps, belief, match_map, registration, (2.0,))
+    marginalised(knots, steps, belief, np.zeros(N_SHARED), registration)
+    settle(np.eye(4), match_map)
+
+
+def _beside_others(points_m: F64) -> None:
+    """Look for what travels along with a vehicle that drives."""
+    co_moving, forward = CoMoving(np.eye(4)), np.eye(4)
+    forward[0, 3] = 1.0
+    sweep, offset_ns = points_m.astype(np.float32), np.zeros(len(points_m), np.uint32)
+    chosen = np.arange(0, len(points_m), 9)
+    for number in range(LEAST_SWEEPS + 3):
+        t_ns = number * _SWEEP_NS
+        co_moving.see(sweep, offset_ns, t_ns, t_ns, chosen, points_m[chosen], forward)
 
 
 def _find_poles(points_m: F64) -> None:

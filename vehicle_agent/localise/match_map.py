@@ -74,7 +74,7 @@ class MatchMapCache:
     def _make(self, p_map_m: F64) -> MatchMap:
         held = self.local_map
         A, b = held.grid_frame.affine(p_map_m)
-        b = b - held.window_origin_g
+        A, b = np.ascontiguousarray(A), b - held.window_origin_g  # kernels are compiled for one layout
         self._near_m = np.array(p_map_m, dtype=np.float64)
         if self._made is not None and self._generation == held.generation:
             return MatchMap(held.index, A, b, self._made.mean_m, self._made.information)
