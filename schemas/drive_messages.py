@@ -98,12 +98,14 @@ def scan_of(cloud: PointCloud) -> Scan:
     dtype = _dtype_of(tuple((f.name, f.offset, f.type) for f in cloud.fields), cloud.point_stride)
     _check_cloud(cloud, dtype, len(data))
     packed = np.frombuffer(data, dtype)
-    finite = np.isfinite(_xyz_view(packed)).all(axis=1)
-    packed = packed if finite.all() else packed[finite]
     # Copied once into rows of their own: packed points are not aligned, and kernels want one layout.
+    points = np.ascontiguousarray(_xyz_view(packed))
+    finite = np.isfinite(points)
+    if not finite.all():
+        packed, points = packed[finite.all(axis=1)], points[finite.all(axis=1)]
     return Scan(
         t_ns=t_ns,
-        points_m=np.ascontiguousarray(_xyz_view(packed)),
+        points_m=points,
         t_offset_ns=np.ascontiguousarray(packed["t_offset"]),
         ring=packed["ring"].astype(np.uint16) if "ring" in (dtype.names or ()) else None,
     )
