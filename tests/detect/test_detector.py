@@ -207,3 +207,19 @@ def test_a_mask_of_movers_of_the_wrong_length_is_refused(tiles: dict[TileId, Til
     with pytest.raises(ShapeError, match=r"\(3,\) for 5 points"):
         detector.add_scan(np.ones((5, 3)), SENSOR, np.zeros(3, np.bool_))
     assert detector.touched_tiles() == ()
+
+
+def test_records_of_tiles_that_stay_are_those_made_anew(tiles: dict[TileId, Tile]) -> None:
+    """Tiles come, one is replaced, one goes: what the window took over is what a new detector makes."""
+    first, *others = sorted(tiles)
+    local_map = hold({t: tiles[t] for t in others[: len(others) // 2]})
+    detector = ChangeDetector(local_map)
+    assert detector.touched_tiles() == ()
+    for tile_id in [first, *others[len(others) // 2 :]]:
+        local_map.set_tile(tiles[tile_id])
+    local_map.set_tile(replace(tiles[others[0]], version=2, gaussians=tiles[others[0]].gaussians.take([0, 3, 4])))
+    local_map.remove_tile(others[1])
+    taken, anew = (one._current().records for one in (detector, ChangeDetector(local_map)))  # noqa: SLF001
+    assert len(taken.words) == local_map.count > 100
+    np.testing.assert_array_equal(taken.words, anew.words)
+    np.testing.assert_array_equal(taken.block, anew.block)

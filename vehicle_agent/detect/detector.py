@@ -142,10 +142,24 @@ class ChangeDetector:
             origin_g=held.window_origin_g,
             anchor_m=anchor_m,
             state=held.index.copy(),
-            records=make_records(held.mean_map_m, held.cov_m2, anchor_m, self.parameters),
+            records=self._records(anchor_m),
             rows=held.tile_rows,
             tiles={t: tile for t in held.tiles if (tile := held.tile(t)) is not None},
         )
+
+    def _records(self, anchor_m: F64) -> Records:
+        """Records of all Gaussians about an anchor; those of tiles that the window holds already are taken from it."""
+        held, old, fresh = self.local_map, self._window, np.ones(self.local_map.count, np.bool_)
+        known = [] if old is None else [t for t in old.tiles if old.tiles[t] is held.tile(t)]
+        for tile_id in known:
+            fresh[held.tile_rows[tile_id]] = False
+        records = Records.of(len(fresh))
+        records.put(fresh, make_records(held.mean_map_m[fresh], held.cov_m2[fresh], anchor_m, self.parameters))
+        for tile_id in known:
+            assert old is not None
+            rows = held.tile_rows[tile_id]
+            records.put(rows, old.records.taken(old.rows[tile_id], held.mean_map_m[rows] - anchor_m))
+        return records
 
     def _carry_over(self, old: _VoxelWindow, new: _VoxelWindow) -> None:
         """Copy pass counters of the voxels and counters of the Gaussians that both windows hold."""

@@ -35,6 +35,22 @@ class Records:
     words: NDArray[np.int32]
     block: NDArray[np.float32]
 
+    @classmethod
+    def of(cls, n: int) -> "Records":
+        """Room for n."""
+        return cls(np.zeros((n, WORDS), np.int32), np.empty((n, 6), np.float32))
+
+    def put(self, rows: slice | NDArray[np.bool_], others: "Records") -> None:
+        """Copy others into rows of these."""
+        self.words[rows], self.block[rows] = others.words, others.block
+
+    def taken(self, rows: slice, mean_m: NDArray[np.float64]) -> "Records":
+        """A copy of some rows with means (K, 3) about another anchor, counters at zero."""
+        taken = Records(self.words[rows].copy(), self.block[rows])
+        taken.floats[:, MEAN] = mean_m
+        taken.words[:, N_BI:] = 0
+        return taken
+
     @property
     def floats(self) -> NDArray[np.float32]:
         """The same memory read as float32."""
