@@ -219,7 +219,7 @@ def test_records_of_tiles_that_stay_are_those_made_anew(tiles: dict[TileId, Tile
         local_map.set_tile(tiles[tile_id])
     local_map.set_tile(replace(tiles[others[0]], version=2, gaussians=tiles[others[0]].gaussians.take([0, 3, 4])))
     local_map.remove_tile(others[1])
-    taken, anew = (one._current().records for one in (detector, ChangeDetector(local_map)))  # noqa: SLF001
+    taken, anew = (one._current().records for one in (detector, ChangeDetector(local_map)))
     assert len(taken.words) == local_map.count > 100
     np.testing.assert_array_equal(taken.words, anew.words)
     np.testing.assert_array_equal(taken.block, anew.block)
