@@ -41,6 +41,8 @@ def R_from_quaternion_xyzw(q: npt.ArrayLike) -> F64:
 def quaternion_xyzw_from_R(R: npt.ArrayLike) -> F64:
     """(..., 4) unit quaternions, w >= 0, of rotations (..., 3, 3): of Shepperd's four forms the best conditioned."""
     m = np.asarray(R, dtype=np.float64)
+    if m.shape == (3, 3):
+        return _quaternion_of_one(m)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     x, y, z = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
@@ -55,6 +57,21 @@ def quaternion_xyzw_from_R(R: npt.ArrayLike) -> F64:
     q = np.take_along_axis(stacked, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
+
+
+def _quaternion_of_one(R: F64) -> F64:
+    """The same of one rotation, in plain numbers."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+    x, y, z, trace = zy - yz, xz - zx, yx - xy, xx + yy + zz
+    forms = (
+        (1.0 + xx - yy - zz, xy + yx, xz + zx, x),
+        (xy + yx, 1.0 - xx + yy - zz, yz + zy, y),
+        (xz + zx, yz + zy, 1.0 - xx - yy + zz, z),
+        (x, y, z, 1.0 + trace),
+    )
+    sizes = (xx, yy, zz, trace)
+    q = np.array(forms[sizes.index(max(sizes))])
+    return np.asarray(q / math.copysign(math.sqrt(float(q @ q)), -1.0 if q[3] < 0.0 else 1.0))
 
 
 def exp_so3(rotation_vector: npt.ArrayLike) -> F64:

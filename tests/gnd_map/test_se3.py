@@ -114,3 +114,6 @@ def test_one_rotation_is_what_many_are(angle_rad: float) -> None:
     one = np.stack([exp_so3(v) for v in vectors])
     np.testing.assert_allclose(one, many, rtol=0, atol=1e-15)
     np.testing.assert_allclose(np.stack([log_so3(R) for R in many]), log_so3(many), rtol=0, atol=1e-14)
+    q = np.stack([quaternion_xyzw_from_R(R) for R in many])
+    np.testing.assert_allclose(q, quaternion_xyzw_from_R(many), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.stack([R_from_quaternion_xyzw(one) for one in q]), many, rtol=0, atol=1e-15)
