@@ -209,6 +209,7 @@ def run(
         from gnd.deploy.fleet import run_fleet
         from gnd.deploy.live import progress_bars
         from gnd.deploy.processes import start_fork_server
+        from gnd.tile_store.catalogs import sign_unsigned_catalogs
         from gnd.tile_store.signatures import sign_unsigned
         from gnd.tile_store.signing import Signing
         from gnd.tile_store.sqlite_store import SqliteStore
@@ -237,6 +238,7 @@ def run(
         prepared = dataclasses.replace(prepared, identities=identities)
         with SqliteStore(folder.store, signing=Signing(identities / "fleet")) as store:
             sign_unsigned(store)  # the base map: without that no vehicle would take it
+            sign_unsigned_catalogs(store)
     prepare_s = time.monotonic() - started_s
     with orderly(), place() as site:
         outcome = run_fleet(config, folder, prepared, console, threading.Event(), site, page=page)

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.tile_store import tables
+from gnd.tile_store.catalogs import answered_catalogs, sign_whole_catalog
 from gnd.tile_store.errors import NotPublished
 from gnd.tile_store.location import LOCATION, StoreLocation, shown
 from gnd.tile_store.options import json_option, region_option, show, to_publish
@@ -30,7 +31,8 @@ def sign(path: StoreLocation, region: str, unchecked: bool, dry_run: bool, as_js
     A map from before signatures: all of it. After `gnd certs revoke` of a shard: what it had signed. Merged versions
     are computed anew from their reports first, and signed where that gives the same, bit for bit. Bases and rollbacks
     of a revoked or foreign signer, and merges whose reports are gone, are signed with --unchecked alone. What was
-    changed after it was signed is never signed; roll it back, or import it again. Ends with 1 where something is left.
+    changed after it was signed is never signed; roll it back, or import it again. Then the catalogs of districts for
+    which nobody answers, or that name other versions than are there (--unchecked). Ends with 1 where something is left.
     """
     with to_publish(path) as store:
         if store.signing is None:
@@ -43,12 +45,27 @@ def sign(path: StoreLocation, region: str, unchecked: bool, dry_run: bool, as_js
         left = dict(_left(store, path, open_ones, unchecked=unchecked))
         to_sign = [one for one in open_ones if one not in left]
         signed = len(to_sign) if dry_run else sign_versions(store, to_sign)
+        catalogs, unsigned = _catalogs(store, region, unchecked=unchecked, dry_run=dry_run)
     values: dict[str, Any] = {"versions": len(found), "signed": signed, "left": len(left), "dry_run": dry_run}
+    values |= {"catalogs_signed": catalogs, "left_catalogs": unsigned}
     rows = [asdict(one) | {"tile": one.tile.path, "left_because": why} for one, why in left.items()]
     title = f"{shown(path)}: {'would be signed' if dry_run else 'signed'}"
     show(values | {"left_versions": rows}, as_json, lambda console: _print(console, title, values, rows))
-    if left:
+    if left or unsigned:
         raise SystemExit(1)
+
+
+def _catalogs(store: SqlStore, region: str, *, unchecked: bool, dry_run: bool) -> tuple[int, list[dict[str, str]]]:
+    """Sign the catalogs for which nobody answers: how many, and of those that are left why."""
+    assert store.signing is not None
+    publishers, signed, left = store.signing.publishers, 0, list[dict[str, str]]()
+    for layer in store.layers():
+        open_ones = [one for one in answered_catalogs(store, publishers, layer, region) if one.status != GOOD]
+        for one in open_ones:
+            why = "" if dry_run else sign_whole_catalog(store, layer, one.district, unchecked=unchecked)
+            signed += not why
+            left += [{"layer": layer, "district": one.district.path, "left_because": why}] if why else []
+    return signed, left
 
 
 def _left(
@@ -75,7 +92,11 @@ def _left(
 
 def _print(console: Console, title: str, values: dict[str, Any], rows: list[dict[str, Any]]) -> None:
     told = {"versions looked at": values["versions"], "signed": values["signed"], "left": values["left"]}
+    told |= {"catalogs signed": values["catalogs_signed"], "catalogs left": len(values["left_catalogs"])}
     console.print(tables.fields(title, told | dict(Counter(f"left, {row['status']}" for row in rows))))
     for row in rows[:20]:
         line = f"{row['layer']} {row['tile']} version {row['version']} {row['status']}: {row['left_because']}"
+        console.print(line, highlight=False, soft_wrap=True)
+    for one in values["left_catalogs"][:20]:
+        line = f"catalog of district {one['district']} of layer {one['layer']}: {one['left_because']}"
         console.print(line, highlight=False, soft_wrap=True)

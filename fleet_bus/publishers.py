@@ -192,6 +192,11 @@ class Publishers:
         """Whether the certificate of this id was shown."""
         return self._shown(signer) is not None
 
+    def is_revoked(self, signer: bytes) -> bool:
+        """Whether the certificate of this id was shown, and is on the list of the revoked."""
+        known = self._shown(signer)
+        return known is not None and bool(known.serials & self._revoked.serials())
+
     def learn(self, chain: bytes) -> bytes:
         """Take a certificate with those between it and the authority, whether it still holds or not; its id.
 

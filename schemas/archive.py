@@ -15,6 +15,7 @@ from typing import Final
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import limits
 from gnd.schemas.archive_seal import DIGEST_BYTES, Sealed, without_seal
+from gnd.schemas.catalog_signature import CatalogSignature, catalog_signature_message, decode_catalog_signature
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import archive_index_pb2, archive_root_pb2
 from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
@@ -122,6 +123,8 @@ class ArchiveIndex:
     layer: str
     district: District
     entries: tuple[ArchiveEntry, ...] = ()
+    catalog: CatalogSignature | None = None
+    """Of who answers for the district's catalog on the bus; None: nobody does."""
     sealed: Sealed | None = field(default=None, compare=False)
     """Its seal, of one that was read; None: nobody answers for it."""
 
@@ -163,6 +166,7 @@ class ArchiveIndex:
             packs_of=[number[entry.pack] for entry in self.entries],
             starts=[entry.start for entry in self.entries],
             sizes=[entry.size for entry in self.entries],
+            catalog=catalog_signature_message(self.catalog),
         )
         return serialise(message, limits.MAX_ARCHIVE_INDEX_BYTES)
 
@@ -175,7 +179,9 @@ class ArchiveIndex:
         check_length("ArchiveIndex", len(message.places), _TILES, "tiles")
         with refusing("ArchiveIndex"):
             district = District(message.district)
-            return cls(message.layer, district, tuple(_entries(message, district, _packs(message))), sealed)
+            entries = tuple(_entries(message, district, _packs(message)))
+            catalog = decode_catalog_signature(message.catalog) if message.HasField("catalog") else None
+            return cls(message.layer, district, entries, catalog, sealed)
 
 
 def _packs(message: archive_index_pb2.ArchiveIndex) -> list[Pack]:

@@ -12,6 +12,7 @@ from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import limits
+from gnd.schemas.catalog_signature import CatalogSignature, catalog_signature_message, decode_catalog_signature
 from gnd.schemas.errors import BadValue, WrongHash
 from gnd.schemas.generated import (
     catalog_entry_pb2,
@@ -305,6 +306,8 @@ class Catalog:
     """What a district holds: one entry a tile, ascending."""
 
     entries: tuple[CatalogEntry, ...] = ()
+    signature: CatalogSignature | None = None
+    """Of who answers for the entries, all of them; None: nobody does."""
 
     def __post_init__(self) -> None:
         check_length("Catalog", len(self.entries), limits.MAX_TILES_OF_DISTRICT, "entries")
@@ -318,7 +321,9 @@ class Catalog:
             catalog_entry_pb2.CatalogEntry(tile=entry.tile.morton, version=entry.version, sha=entry.sha)
             for entry in self.entries
         )
-        return serialise(catalog_pb2.Catalog(major=MAJOR, entries=entries), limits.MAX_CATALOG_BYTES)
+        signature = catalog_signature_message(self.signature)
+        message = catalog_pb2.Catalog(major=MAJOR, entries=entries, signature=signature)
+        return serialise(message, limits.MAX_CATALOG_BYTES)
 
     @classmethod
     def decode(cls, data: bytes) -> "Catalog":
@@ -326,4 +331,7 @@ class Catalog:
         message = parse(catalog_pb2.Catalog, data, limits.MAX_CATALOG_BYTES)
         check_major(message, "Catalog")
         check_length("Catalog", len(message.entries), limits.MAX_TILES_OF_DISTRICT, "entries")
-        return cls(tuple(CatalogEntry(tile_id(e.tile), e.version, e.sha) for e in message.entries))
+        return cls(
+            tuple(CatalogEntry(tile_id(e.tile), e.version, e.sha) for e in message.entries),
+            decode_catalog_signature(message.signature) if message.HasField("signature") else None,
+        )

@@ -1,21 +1,127 @@
-"""Whether a catalog goes back behind what its reader has seen: signed versions, and notices that a shard has sealed.
+"""Whether a catalog is one to use: a publisher of the pinned authority has signed it as it is, with nothing left out,
+and no newer one was seen; and whether it goes back behind what its reader has seen otherwise.
 
 A catalog is sealed by the tile server that answers, and bound to the question, so neither router nor cache can forge or
-keep one. A tile server that was broken into can: what it names and nobody has signed is refused when the tile comes
-(`checking`), and what it leaves out or sets back is noticed here.
+keep one. A tile server that was broken into can only hand out what was signed once: who has seen a newer one refuses
+it, and who has seen nothing yet sees how old it is.
 """
 
 import logging
+import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Final
 
+from gnd.fleet_bus.errors import NotAnsweredFor, SealError
+from gnd.fleet_bus.publishers import Publishers
 from gnd.fleet_bus.refusals import counted
 from gnd.fleet_bus.seldom import Seldom
-from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.tiles import CatalogEntry
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.archive_seal import SealNumber
+from gnd.schemas.catalog_signature import CatalogSignature, CatalogStatement
+from gnd.schemas.errors import BadValue, NotSigned
+from gnd.schemas.tiles import Catalog, CatalogEntry
+from gnd.tile_client.archive_check import SeenStates
 
 _SELDOM: Final = Seldom(logging.getLogger(__name__))
+NOTICED_AFTER_S: Final = 86_400.0
+"""A catalog that was signed longer ago is told of in the log; running shards sign each once an hour."""
+
+
+class CatalogCheck:
+    """Checks the catalogs of one layer. Safe in several threads.
+
+    Args:
+        publishers: whose signature counts.
+        layer: name of the layer.
+        seen: which states of districts were seen before.
+        oldest_s: a catalog that was signed longer ago is refused, s; None: any age will do, and a great one is told.
+    """
+
+    def __init__(
+        self, publishers: Publishers, layer: str, seen: SeenStates | None = None, oldest_s: float | None = None
+    ) -> None:
+        self._publishers, self._layer, self._oldest_s = publishers, layer, oldest_s
+        self._seen = SeenStates() if seen is None else seen
+
+    def check(self, district: District, catalog: Catalog) -> None:
+        """Take note of the catalog that came for a district.
+
+        Raises:
+            NotSigned: it is not to be used; why. It is counted (`gnd_refusals`, kind "catalog").
+        """
+        try:
+            self._check(district, catalog)
+        except _RefusedCatalogError as refused:
+            counted("catalog", refused.reason)
+            raise NotSigned(f"catalog of district {district} of layer {self._layer}: {refused}") from refused
+
+    def _check(self, district: District, catalog: Catalog) -> None:
+        newest, signed = self._seen.newest(self._name(district)), catalog.signature
+        if signed is None:
+            if not catalog.entries and newest == SealNumber():
+                return  # nothing is mapped there; who leaves a whole district out cannot be told from that
+            raise _RefusedCatalogError(
+                "unsigned",
+                "nobody has signed it: the tile server or the shards may be of an older release (shards sign each"
+                " district when they start, `gnd map sign` does where there are none)",
+            )
+        try:
+            statement = CatalogStatement.of(self._layer, district, catalog.entries)
+            self._publishers.check(signed.signer, signed.signed_s, signed.text(statement), signed.signature)
+        except BadValue as error:
+            raise _RefusedCatalogError("wrong", str(error)) from error
+        except NotAnsweredFor as error:
+            raise _RefusedCatalogError(error.why, f"{error}; {len(catalog.entries)} tiles are named") from error
+        except SealError as error:
+            raise _RefusedCatalogError("unknown", str(error)) from error
+        self._check_order(district, signed, newest)
+
+    def _check_order(self, district: District, signed: CatalogSignature, newest: SealNumber) -> None:
+        if signed.order < newest:
+            raise _RefusedCatalogError(
+                "older",
+                f"number {signed.number} was signed {newest.signed_s - signed.signed_s} s before number"
+                f" {newest.number}, which was seen before",
+            )
+        age_s = time.time() - signed.signed_s
+        if self._oldest_s is not None and age_s > self._oldest_s:
+            raise _RefusedCatalogError(
+                "too old",
+                f"number {signed.number} was signed {age_s / 3600:.1f} h ago, at most {self._oldest_s / 3600:.1f} h are"
+                " wanted: newer ones are withheld, or no shard has run since",
+            )
+        if age_s > NOTICED_AFTER_S:
+            counted("catalog", "old")
+            _SELDOM.warning(
+                "the catalog of district %s of layer %s was signed %.1f h ago: newer ones are withheld, or no shard has"
+                " run since",
+                district,
+                self._layer,
+                age_s / 3600,
+            )
+        if signed.number < newest.number:
+            _SELDOM.warning(
+                "the catalog of district %s of layer %s is number %d (%s), and number %d was seen before: its store was"
+                " restored from a backup, or built anew",
+                district,
+                self._layer,
+                signed.number,
+                signed.kind,
+                newest.number,
+            )
+        self._seen.note(self._name(district), signed.order)
+
+    def _name(self, district: District) -> str:
+        return f"{self._layer}/{district}"
+
+
+class _RefusedCatalogError(Exception):
+    """Why a catalog is not used, in a word and in a sentence."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
 
 
 def set_back(

@@ -1,5 +1,6 @@
 """Tiles of any region from the tile server, in batches of one district."""
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -7,18 +8,21 @@ from typing import Final
 
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import RequestFailed
+from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.region import Region
-from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.keys import batch_key, catalog_keys
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.errors import NotSigned
+from gnd.schemas.keys import batch_key, catalog_keys, parse_catalog_key
 from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.schemas.updates import TileUpdate
-from gnd.tile_client.catalog_check import set_back
+from gnd.tile_client.catalog_check import CatalogCheck, set_back
 from gnd.tile_client.checking import SeenInMemory, VersionCheck
 from gnd.tile_client.exchange import Exchange, ExchangeOutcome, TilesInMemory
 
 BATCH_BYTES: Final = 1_000_000
 """Bodies of one answer: large enough that a district comes in a few, small enough for a slow link."""
+_SELDOM: Final = Seldom(logging.getLogger(__name__))
 _NOTHING_HELD: Final[Mapping[TileId, AnyTile]] = {}
 
 
@@ -31,7 +35,10 @@ class TileServerClient:
         layer: name of the layer.
         timeout_s: how long one question is asked again before it fails.
         newest: fetch the newest versions, also those that are on trial with a share of the vehicles.
+        oldest_catalog_s: a catalog that was signed longer ago is refused, s; None: any age will do. A session without
+            an identity looks at no signatures.
         check: of the versions that come: by the identity of the bus; None where it has none.
+        refused: districts whose catalog was refused when it was last asked for, and why.
         behind: tiles of which the last catalog names an older version than was seen, or none: see
             `catalog_check.set_back`.
     """
@@ -40,26 +47,59 @@ class TileServerClient:
     layer: str
     timeout_s: float
     newest: bool = False
+    oldest_catalog_s: float | None = None
     check: VersionCheck | None = field(init=False, repr=False)
     behind: dict[TileId, int | None] = field(init=False, repr=False, default_factory=dict)
+    refused: dict[District, str] = field(init=False, repr=False, default_factory=dict)
     _seen: SeenInMemory = field(init=False, repr=False, default_factory=SeenInMemory)
+    _catalogs: CatalogCheck | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "check", VersionCheck.on_the_bus(self.bus, self.layer, self._seen))
+        check = VersionCheck.on_the_bus(self.bus, self.layer, self._seen)
+        object.__setattr__(self, "check", check)
+        if check is not None:
+            catalogs = CatalogCheck(check.publishers, self.layer, oldest_s=self.oldest_catalog_s)
+            object.__setattr__(self, "_catalogs", catalogs)
 
     def catalog(self, region: Region) -> list[CatalogEntry]:
         """The newest version of each tile of the region, by tile; that it goes back behind what was seen is noticed.
 
+        A district whose catalog nobody answers for, or that is an older one than was seen, is left out, told in the log
+        and in `refused`.
+
         Raises:
             RequestFailed: nobody answers within `timeout_s`.
+            NotSigned: of no district that was answered for there is a catalog to use.
+            SchemaError: an answer that is none.
         """
         keys, seen = catalog_keys(self.layer, region.prefix), self._seen.versions(region)
+        self.refused.clear()
         replies = self.bus.request_many(keys, b"", kind="catalog", timeout_s=self.timeout_s)
-        entries = [entry for _, payload in replies for entry in Catalog.decode(payload).entries if entry.tile in region]
-        behind = set_back(self.layer, seen, entries, newest=self.newest)
+        found = {key: some for key, payload in replies if (some := self._entries(key, payload)) is not None}
+        entries = [entry for some in found.values() for entry in some if entry.tile in region]
+        told = {tile: version for tile, version in seen.items() if tile.district not in self.refused}
+        behind = set_back(self.layer, told, entries, newest=self.newest)
         self.behind.clear()
         self.behind.update(behind)
+        if not found and self.refused:
+            raise NotSigned(next(iter(self.refused.values())))
         return sorted(entries, key=lambda entry: entry.tile)
+
+    def _entries(self, key: str, payload: bytes) -> tuple[CatalogEntry, ...] | None:
+        """What a district's catalog names; None: it is refused."""
+        catalog = Catalog.decode(payload)
+        if self._catalogs is None:
+            return catalog.entries
+        layer, district = parse_catalog_key(key)
+        try:
+            if layer != self.layer:
+                raise NotSigned(f"asked for catalogs of layer {self.layer}, got one of layer {layer}")
+            self._catalogs.check(district, catalog)
+        except NotSigned as error:
+            self.refused[district] = str(error)
+            _SELDOM.warning("%s", error)
+            return None
+        return catalog.entries
 
     def note_announced(self, update: TileUpdate) -> None:
         """A notice that a shard has sealed: from now on an older version will not do, nor a catalog that names one."""

@@ -12,6 +12,7 @@ from gnd.gnd_map.day import UNKNOWN_DAY, ns_of
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import TileBlob
 from gnd.schemas.version_signature import VersionSignature
+from gnd.tile_store import sql_catalogs as catalogs
 from gnd.tile_store import sql_journal as journal
 from gnd.tile_store.connection import SqlConnection, change, fetch, post
 from gnd.tile_store.errors import StoreError
@@ -88,6 +89,7 @@ def _put(c: SqlConnection, layer: str, one: MirroredTile, now: int) -> None:
         "epoch": blob.version,
     }
     post(c, "insert_version", row | _signed(c, one))
+    catalogs.forget(c, layer, blob.tile.district)  # until the whole district has come (`mirror_catalog`)
     if change(c, "swap_head" if before else "insert_head", row) != 1:
         raise StoreError(f"tile {blob.tile.path} of layer {layer}: head {before} has moved inside a transaction")
     journal.begin_epoch(c, layer, blob.tile, blob.version)

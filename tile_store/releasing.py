@@ -9,6 +9,7 @@ from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile import diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
+from gnd.tile_store import sql_catalogs as catalogs
 from gnd.tile_store import sql_inbox as inbox
 from gnd.tile_store import sql_trials as trials
 from gnd.tile_store import sql_versions as versions
@@ -25,8 +26,9 @@ def release(store: SqlStore, trial: VersionTrial, who: str, why: str, verdict: V
     """The version is everybody's from now on, and its notice goes out; False: the trial was settled already."""
 
     def work(c: SqlConnection, now: int) -> bool:
-        if not trials.set_state(c, trial, "released", _text(trial, verdict), now):
-            return False
+        with catalogs.changing(c, store.signing, trial.layer, trial.tile):
+            if not trials.set_state(c, trial, "released", _text(trial, verdict), now):
+                return False
         place = {"layer": trial.layer, "tile": trial.tile.morton, "version": trial.version}
         change(c, "insert_notice", place | {"created_ns": now})
         trials.steer(c, trial.place, who, "released", why, now)
@@ -44,10 +46,11 @@ def withdraw(store: SqlStore, trial: VersionTrial, who: str, why: str, verdict: 
     report_ids = behind(store, trial)
 
     def work(c: SqlConnection, now: int) -> bool:
-        if not trials.set_state(c, trial, "withdrawn", _text(trial, verdict), now):
-            return False
-        trials.doubt(c, trial.place, report_ids, now)
-        versions.rollback(c, trial.layer, trial.tile, trial.base_version, now, store.signing)
+        with catalogs.changing(c, store.signing, trial.layer, trial.tile, "rollback"):
+            if not trials.set_state(c, trial, "withdrawn", _text(trial, verdict), now):
+                return False
+            trials.doubt(c, trial.place, report_ids, now)
+            versions.roll_back_released(c, trial.layer, trial.tile, trial.base_version, now, store.signing)
         trials.steer(c, trial.place, who, "withdrawn", why, now)
         return True
 

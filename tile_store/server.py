@@ -23,13 +23,13 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import keys
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.limits import MAX_TILES_OF_DISTRICT
-from gnd.schemas.tiles import Catalog, TileRequest
+from gnd.schemas.tiles import TileRequest
 from gnd.schemas.tiles_batch import TilesRequest
 from gnd.tile_store.answers import TileAnswers, reads_layer
 from gnd.tile_store.districts import DistrictOwners, KnownOwners
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.regions import TileRegion
-from gnd.tile_store.released import released, released_each, released_heads
+from gnd.tile_store.released import released, released_each
 from gnd.tile_store.store import Store
 from gnd.tile_store.warm import warm_up
 
@@ -269,7 +269,7 @@ class TileServer:
                     yield keys.catalog_key(layer, district), catalog
 
     def _catalog(self, layer: str, district: District) -> bytes:
-        return Catalog(tuple(released_heads(self._store, layer, district.path))).encode()
+        return self._store.catalog(layer, district).encode()
 
     def _tiles(self, region: TileRegion) -> Iterator[tuple[str, TileId]]:
         for layer in self._store.layers() if region.layer is None else [region.layer]:

@@ -14,6 +14,7 @@ from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.publishers import PublisherKey, Publishers
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.archive_seal import ArchiveSeal, Sealed, SealedPart, SealNumber, sealed_text
+from gnd.schemas.catalog_signature import CatalogKind, CatalogSignature, CatalogStatement
 from gnd.schemas.version_signature import VersionSignature, VersionStatement
 from gnd.tile_store.connection import SqlConnection, change, fetch, post
 from gnd.tile_store.errors import NotPublished, StoreDamaged
@@ -55,6 +56,28 @@ class Signing:
             raise NotPublished(f"nothing can be signed, and so nothing published: {error}") from error
         return VersionSignature(signer, statement.kind, statement.made_s, signed_s, signature), chain
 
+    def sign_catalog(
+        self, statement: CatalogStatement, kind: CatalogKind, before: CatalogSignature | None
+    ) -> tuple[CatalogSignature, bytes]:
+        """The signature under the state of a district, and the certificates behind it.
+
+        Args:
+            statement: what is signed.
+            kind: how it came about.
+            before: the signature under the state that it replaces.
+
+        Raises:
+            NotPublished: the certificate of this process has ended.
+        """
+        order = _next(None if before is None else before.order)
+        try:
+            signer, signature, chain = self._key.sign(
+                lambda signer: statement.text(kind, order, signer), order.signed_s
+            )
+        except IdentityError as error:
+            raise NotPublished(f"no catalog can be signed, and so nothing published: {error}") from error
+        return CatalogSignature(order.number, order.signed_s, kind, signer, signature), chain
+
     def seal(
         self, part: SealedPart, body: bytes, archive: bytes, before: ArchiveSeal | None
     ) -> tuple[ArchiveSeal, bytes]:
@@ -69,9 +92,7 @@ class Signing:
         Raises:
             NotPublished: the certificate of this process has ended.
         """
-        # clocks step: what replaces another is not older
-        now_s, body_sha = time.time_ns() // NS_PER_S, sha256(body).digest()
-        order = SealNumber(now_s, 1) if before is None else SealNumber(max(now_s, before.signed_s), before.number + 1)
+        body_sha, order = sha256(body).digest(), _next(None if before is None else before.order)
         try:
             signer, signature, chain = self._key.sign(
                 lambda signer: sealed_text(part, body_sha, archive, order, signer), order.signed_s
@@ -89,6 +110,12 @@ class Signing:
         except SealError:
             return False
         return True
+
+
+def _next(before: SealNumber | None) -> SealNumber:
+    """The order of what is signed now. Clocks step: what replaces another is not older."""
+    now_s = time.time_ns() // NS_PER_S
+    return SealNumber(now_s, 1) if before is None else SealNumber(max(now_s, before.signed_s), before.number + 1)
 
 
 def columns(c: SqlConnection, signing: Signing | None, row: Mapping[str, Any], day: int) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import BadValue
 from gnd.schemas.version_signature import VersionSignature
 from gnd.tile_store import sql_accounts as accounts
+from gnd.tile_store import sql_catalogs as catalogs
 from gnd.tile_store import sql_confirmation as confirmation
 from gnd.tile_store import sql_inbox as inbox
 from gnd.tile_store import sql_journal as journal
@@ -71,13 +72,7 @@ def publish(
     _check_reports(c, publication)
     result = PublishResult("unchanged", head.version)
     if content is not None and content.sha != head.sha:
-        provenance = Provenance.of(publication.report_ids, publication.voxel_reports)
-        origin = _Origin(publication.reason, claim.owner, provenance)
-        version = _append(c, claim.layer, claim.tile, content, origin, timing["now"], signing)
-        result = PublishResult("published", version)
-        if publication.trial is not None and head.version and not is_feature_layer(claim.layer):
-            pair = head.version, result.version
-            trials.begin(c, claim.layer, claim.tile, pair, publication.trial, timing["now"])
+        result = _appended(c, publication, content, head, timing["now"], signing)
     basis = publication.basis
     if basis is not None and result.status == "published":
         journal.put_basis(c, claim.layer, claim.tile, result.version, basis)
@@ -91,6 +86,19 @@ def publish(
     accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
     _put_tests(c, publication, timing, is_news)
     return result
+
+
+def _appended(
+    c: SqlConnection, publication: Publication, content: Content, head: _Head, now: int, signing: Signing | None
+) -> PublishResult:
+    """The next version of a tile, on trial where that is wanted."""
+    claim = publication.claim
+    origin = _Origin(publication.reason, claim.owner, Provenance.of(publication.report_ids, publication.voxel_reports))
+    with catalogs.changing(c, signing, claim.layer, claim.tile, catalogs.kind_of(origin.kind)):
+        version = _append(c, claim.layer, claim.tile, content, origin, now, signing)
+        if publication.trial is not None and head.version and not is_feature_layer(claim.layer):
+            trials.begin(c, claim.layer, claim.tile, (head.version, version), publication.trial, now)
+    return PublishResult("published", version)
 
 
 def _put_tests(c: SqlConnection, publication: Publication, timing: dict[str, Any], is_news: bool) -> None:
@@ -122,8 +130,10 @@ def put_base(
     """Import a tile: a new epoch, unless the head is an epoch of the same content."""
     head = _head(c, layer, tile)
     is_known = bool(head.version) and head.version == head.epoch and head.sha == content.sha
-    origin = _Origin(kind, surveyed_ns=surveyed_ns)
-    version = head.version if is_known else _append(c, layer, tile, content, origin, now, signing)
+    version = head.version
+    if not is_known:
+        with catalogs.changing(c, signing, layer, tile, catalogs.kind_of(kind)):
+            version = _append(c, layer, tile, content, _Origin(kind, surveyed_ns=surveyed_ns), now, signing)
     if surveyed_ns is not None:
         row = {"layer": layer, "tile": tile.morton, "version": version, "surveyed_ns": surveyed_ns}
         change(c, "put_survey", row)
@@ -143,6 +153,14 @@ def _sign_known(c: SqlConnection, layer: str, tile: TileId, sha: bytes, signing:
 
 def rollback(c: SqlConnection, layer: str, tile: TileId, version: int, now: int, signing: Signing | None) -> StoredTile:
     """Publish the next version with the body of an older one."""
+    with catalogs.changing(c, signing, layer, tile, "rollback"):
+        return roll_back_released(c, layer, tile, version, now, signing)
+
+
+def roll_back_released(
+    c: SqlConnection, layer: str, tile: TileId, version: int, now: int, signing: Signing | None
+) -> StoredTile:
+    """As `rollback`, for who has begun to change the catalog already."""
     old = stored(c, "stored_version", layer, tile, version=version)
     if old is None:
         newest = _head(c, layer, tile).version

@@ -13,9 +13,10 @@ from typing import Any, Final, Protocol, Self, TypeVar
 
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District, TileId
-from gnd.schemas.tiles import CatalogEntry
+from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.tile_store import borders, clocks
 from gnd.tile_store import sql_accounts as accounts
+from gnd.tile_store import sql_catalogs as catalogs
 from gnd.tile_store import sql_confirmation as confirmation
 from gnd.tile_store import sql_inbox as inbox
 from gnd.tile_store import sql_journal as journal
@@ -747,6 +748,11 @@ class SqlStore(ABC):
         """Give the store's region a name, and say whose the districts are of which nothing else is said."""
         row = {"region": name, "state": rest, "since_ns": self._now_ns()}
         self._writer.run(lambda c: change(c, "put_rest", row))
+
+    def catalog(self, layer: str, district: District) -> Catalog:
+        """See `Store.catalog`."""
+        with self._readers.snapshot() as c:
+            return catalogs.catalog_of(c, layer, district)
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """See `Store.heads`."""

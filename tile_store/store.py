@@ -6,7 +6,7 @@ from typing import Protocol
 
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import District, TileId
-from gnd.schemas.tiles import CatalogEntry
+from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.tile_store.districts import DistrictOwners
 from gnd.tile_store.roads import RoadPart
 from gnd.tile_store.trials import VersionTrial
@@ -349,6 +349,11 @@ class Store(Protocol):
 
     def district_owners(self) -> DistrictOwners:
         """Which districts this store owns, where several share a map."""
+
+    def catalog(self, layer: str, district: District) -> Catalog:
+        """The newest released versions of a district's tiles, with the signature of who answers for all of them, as
+        they are at one instant.
+        """
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """The newest versions of a region's tiles (a prefix of their path), sorted by tile."""

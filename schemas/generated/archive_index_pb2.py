@@ -23,15 +23,16 @@ _sym_db = _symbol_database.Default()
 
 
 from . import archive_seal_pb2 as gnd_dot_v1_dot_archive__seal__pb2
+from . import catalog_signature_pb2 as gnd_dot_v1_dot_catalog__signature__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/archive_index.proto\x12\x06gnd.v1\x1a\x19gnd/v1/archive_seal.proto\"\xf7\x01\n\x0c\x41rchiveIndex\x12\r\n\x05major\x18\x01 \x01(\r\x12\r\n\x05layer\x18\x02 \x01(\t\x12\x10\n\x08\x64istrict\x18\x03 \x01(\t\x12\r\n\x05packs\x18\x04 \x01(\x0c\x12\x12\n\npack_bytes\x18\x05 \x03(\r\x12\x0e\n\x06places\x18\x06 \x03(\r\x12\x10\n\x08versions\x18\x07 \x03(\r\x12\x0e\n\x06hashes\x18\x08 \x01(\x0c\x12\x0e\n\x06signed\x18\t \x01(\x0c\x12\x10\n\x08packs_of\x18\n \x03(\r\x12\x0e\n\x06starts\x18\x0b \x03(\r\x12\r\n\x05sizes\x18\x0c \x03(\r\x12!\n\x04seal\x18\r \x01(\x0b\x32\x13.gnd.v1.ArchiveSealb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/archive_index.proto\x12\x06gnd.v1\x1a\x19gnd/v1/archive_seal.proto\x1a\x1egnd/v1/catalog_signature.proto\"\xa2\x02\n\x0c\x41rchiveIndex\x12\r\n\x05major\x18\x01 \x01(\r\x12\r\n\x05layer\x18\x02 \x01(\t\x12\x10\n\x08\x64istrict\x18\x03 \x01(\t\x12\r\n\x05packs\x18\x04 \x01(\x0c\x12\x12\n\npack_bytes\x18\x05 \x03(\r\x12\x0e\n\x06places\x18\x06 \x03(\r\x12\x10\n\x08versions\x18\x07 \x03(\r\x12\x0e\n\x06hashes\x18\x08 \x01(\x0c\x12\x0e\n\x06signed\x18\t \x01(\x0c\x12\x10\n\x08packs_of\x18\n \x03(\r\x12\x0e\n\x06starts\x18\x0b \x03(\r\x12\r\n\x05sizes\x18\x0c \x03(\r\x12!\n\x04seal\x18\r \x01(\x0b\x32\x13.gnd.v1.ArchiveSeal\x12)\n\x07\x63\x61talog\x18\x0e \x01(\x0b\x32\x18.gnd.v1.CatalogSignatureb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.archive_index_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_ARCHIVEINDEX']._serialized_start=66
-  _globals['_ARCHIVEINDEX']._serialized_end=313
+  _globals['_ARCHIVEINDEX']._serialized_start=98
+  _globals['_ARCHIVEINDEX']._serialized_end=388
 # @@protoc_insertion_point(module_scope)

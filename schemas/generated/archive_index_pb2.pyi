@@ -5,6 +5,7 @@ isort:skip_file
 
 from collections import abc as _abc
 from . import archive_seal_pb2 as _archive_seal_pb2
+from . import catalog_signature_pb2 as _catalog_signature_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -41,6 +42,7 @@ class ArchiveIndex(_message.Message):
     STARTS_FIELD_NUMBER: _builtins.int
     SIZES_FIELD_NUMBER: _builtins.int
     SEAL_FIELD_NUMBER: _builtins.int
+    CATALOG_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     layer: _builtins.str
@@ -83,6 +85,10 @@ class ArchiveIndex(_message.Message):
     def seal(self) -> _archive_seal_pb2.ArchiveSeal:
         """Who answers for all that comes before it in the file; the last field of the file. Missing: nobody does."""
 
+    @_builtins.property
+    def catalog(self) -> _catalog_signature_pb2.CatalogSignature:
+        """Who answers for the district's catalog on the bus, for mirrors that answer there; missing: nobody does."""
+
     def __init__(
         self,
         *,
@@ -99,10 +105,11 @@ class ArchiveIndex(_message.Message):
         starts: _abc.Iterable[_builtins.int] | None = ...,
         sizes: _abc.Iterable[_builtins.int] | None = ...,
         seal: _archive_seal_pb2.ArchiveSeal | None = ...,
+        catalog: _catalog_signature_pb2.CatalogSignature | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["seal", b"seal"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["catalog", b"catalog", "seal", b"seal"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["district", b"district", "hashes", b"hashes", "layer", b"layer", "major", b"major", "pack_bytes", b"pack_bytes", "packs", b"packs", "packs_of", b"packs_of", "places", b"places", "seal", b"seal", "signed", b"signed", "sizes", b"sizes", "starts", b"starts", "versions", b"versions"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["catalog", b"catalog", "district", b"district", "hashes", b"hashes", "layer", b"layer", "major", b"major", "pack_bytes", b"pack_bytes", "packs", b"packs", "packs_of", b"packs_of", "places", b"places", "seal", b"seal", "signed", b"signed", "sizes", b"sizes", "starts", b"starts", "versions", b"versions"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -23,15 +23,16 @@ _sym_db = _symbol_database.Default()
 
 
 from . import catalog_entry_pb2 as gnd_dot_v1_dot_catalog__entry__pb2
+from . import catalog_signature_pb2 as gnd_dot_v1_dot_catalog__signature__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x14gnd/v1/catalog.proto\x12\x06gnd.v1\x1a\x1agnd/v1/catalog_entry.proto\"?\n\x07\x43\x61talog\x12\r\n\x05major\x18\x01 \x01(\r\x12%\n\x07\x65ntries\x18\x02 \x03(\x0b\x32\x14.gnd.v1.CatalogEntryb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x14gnd/v1/catalog.proto\x12\x06gnd.v1\x1a\x1agnd/v1/catalog_entry.proto\x1a\x1egnd/v1/catalog_signature.proto\"l\n\x07\x43\x61talog\x12\r\n\x05major\x18\x01 \x01(\r\x12%\n\x07\x65ntries\x18\x02 \x03(\x0b\x32\x14.gnd.v1.CatalogEntry\x12+\n\tsignature\x18\x03 \x01(\x0b\x32\x18.gnd.v1.CatalogSignatureb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.catalog_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_CATALOG']._serialized_start=60
-  _globals['_CATALOG']._serialized_end=123
+  _globals['_CATALOG']._serialized_start=92
+  _globals['_CATALOG']._serialized_end=200
 # @@protoc_insertion_point(module_scope)

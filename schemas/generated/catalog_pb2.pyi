@@ -5,6 +5,7 @@ isort:skip_file
 
 from collections import abc as _abc
 from . import catalog_entry_pb2 as _catalog_entry_pb2
+from . import catalog_signature_pb2 as _catalog_signature_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -27,21 +28,27 @@ class Catalog(_message.Message):
 
     MAJOR_FIELD_NUMBER: _builtins.int
     ENTRIES_FIELD_NUMBER: _builtins.int
+    SIGNATURE_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     @_builtins.property
     def entries(self) -> _containers.RepeatedCompositeFieldContainer[_catalog_entry_pb2.CatalogEntry]:
         """One entry a tile, ascending tile id, no tile twice."""
 
+    @_builtins.property
+    def signature(self) -> _catalog_signature_pb2.CatalogSignature:
+        """Who answers for the entries, all of them; missing: nobody does."""
+
     def __init__(
         self,
         *,
         major: _builtins.int = ...,
         entries: _abc.Iterable[_catalog_entry_pb2.CatalogEntry] | None = ...,
+        signature: _catalog_signature_pb2.CatalogSignature | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["signature", b"signature"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["entries", b"entries", "major", b"major"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["entries", b"entries", "major", b"major", "signature", b"signature"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -68,12 +68,16 @@ class MapUpdate:
         return self.tile.version
 
 
-def connect(router: str = DEFAULT_ENDPOINT, *, timeout_s: float = 10.0) -> "Client":
+def connect(
+    router: str = DEFAULT_ENDPOINT, *, timeout_s: float = 10.0, oldest_catalog_s: float | None = None
+) -> "Client":
     """Join the bus as a client of a router; use it in a `with` block.
 
     Args:
         router: endpoint of the router.
         timeout_s: how long a router is looked for, and how long each question is asked again, s.
+        oldest_catalog_s: with an identity, a catalog that was signed longer ago is refused, s (shards sign each again
+            once an hour); None: any age will do, and one of more than a day is told in the log.
 
     Raises:
         NoRouter: nothing answers at `router` within `timeout_s`; the message says both.
@@ -81,14 +85,14 @@ def connect(router: str = DEFAULT_ENDPOINT, *, timeout_s: float = 10.0) -> "Clie
     """
     bus = open_bus(BusConfig(connect=(router,), open_timeout_s=timeout_s), name="client")
     follow_revoked(bus)
-    return Client(bus, timeout_s)
+    return Client(bus, timeout_s, oldest_catalog_s)
 
 
 class Client:
     """Reads the map that a fleet keeps. Methods may be called from any thread. `connect` makes one."""
 
-    def __init__(self, bus: Bus, timeout_s: float) -> None:
-        self._bus, self._timeout_s = bus, timeout_s
+    def __init__(self, bus: Bus, timeout_s: float, oldest_catalog_s: float | None = None) -> None:
+        self._bus, self._timeout_s, self._oldest_catalog_s = bus, timeout_s, oldest_catalog_s
         self._streams: list[UpdateStream] = []
         self._asked: dict[str, TileServerClient] = {}  # each remembers the newest versions that it has seen
 
@@ -115,6 +119,7 @@ class Client:
         Raises:
             RegionError: `region` is none.
             RequestFailed: no tile server answers within `timeout_s`.
+            NotSigned: with an identity: no publisher answers for the catalog of any district there, or it is too old.
         """
         return self._asking(layer).catalog(as_region(region))
 
@@ -183,7 +188,11 @@ class Client:
         return stream
 
     def _asking(self, layer: str) -> TileServerClient:
-        return self._asked.setdefault(layer, TileServerClient(self._bus, layer, self._timeout_s))
+        known = self._asked.get(layer)
+        if known is None:
+            asking = TileServerClient(self._bus, layer, self._timeout_s, oldest_catalog_s=self._oldest_catalog_s)
+            known = self._asked.setdefault(layer, asking)
+        return known
 
 
 class UpdateStream:

@@ -31,15 +31,18 @@ from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import keys
+from gnd.schemas.errors import NotSigned
 from gnd.schemas.keys import update_keys
 from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.schemas.tiles_batch import TileAnswer
 from gnd.schemas.updates import TileUpdate
 from gnd.tile_client.checking import SeenInMemory, SeenVersion, VersionCheck
 from gnd.tile_client.fetching import TileServerClient
-from gnd.tile_client.following import RegionFollower
+from gnd.tile_client.following import NewVersion, RegionFollower
 from gnd.tile_store import releasing
+from gnd.tile_store import sql_catalogs as catalogs
 from gnd.tile_store import sql_trials as trials
+from gnd.tile_store.connection import SqlConnection
 from gnd.tile_store.errors import NotPublished, StoreDamaged
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -70,6 +73,16 @@ def stored(scene: VersionScene, tile: TileId, version: int | None = None) -> Sto
     found = scene.store.get(LAYER, tile, version)
     assert found is not None
     return found
+
+
+def begin_trial(store: SqliteStore, tile: TileId, terms: TrialTerms) -> None:
+    """Version 2 of a tile goes on trial, as when it is published."""
+
+    def work(c: SqlConnection, now: int) -> None:
+        with catalogs.changing(c, store.signing, LAYER, tile):
+            trials.begin(c, LAYER, tile, (1, 2), terms, now)
+
+    store.transact(work)
 
 
 def until(what: str, condition: Callable[[], object], for_s: float = 20.0) -> None:
@@ -152,7 +165,7 @@ def test_vehicles_on_trial_and_all_others_take_their_versions(scene: VersionScen
     """Both are signed; who has the newer one keeps it whatever its ticket is by then, and nobody is refused."""
     tile = scene.tile(1, 2)
     with SqliteStore(scene.path, create=False, signing=Signing(scene.parts["shard"])) as store:
-        store.transact(lambda c, now: trials.begin(c, LAYER, tile, (1, 2), TrialTerms(0.5, 3600.0), now))
+        begin_trial(store, tile, TrialTerms(0.5, 3600.0))
         trial = store.trials(LAYER)[tile]
         first, other = (
             next(number for number in range(1, 1000) if trial.is_among_first(number) == is_first)
@@ -432,25 +445,23 @@ def test_attack_version_of_four_thousand_million(scene: VersionScene) -> None:
 
 
 def test_attack_catalog_that_lies(scene: VersionScene) -> None:
-    """Its catalog names version 4,000,000,000 of a tile, then invents a new version; a watcher reports nothing that
-    nobody has signed, and does not miss the next true version for it."""
+    """Its catalog names version 4,000,000,000 of a tile; a watcher refuses all of it, and does not miss the next true
+    version for it. A version that a catalog names is still fetched before it is reported."""
     tile, region = scene.tile(1), Region(prefix="")
     asking = TileServerClient(scene.watcher, LAYER, 10.0)
-    scene.server.alter_catalog = lambda said: Catalog(
-        tuple(replace(one, version=4_000_000_000) if one.tile == tile else one for one in said.entries)
-    )
     follower = RegionFollower(scene.watcher, {LAYER: asking}, region, 0.0)
     try:
         follower.begin()
         assert (LAYER, tile) not in follower.known
-        scene.server.alter_catalog = lambda said: Catalog(
-            tuple(replace(one, version=4_000_000_001) if one.tile == tile else one for one in said.entries)
+        scene.server.alter_catalog = lambda said: replace(
+            said,
+            entries=tuple(replace(one, version=4_000_000_000) if one.tile == tile else one for one in said.entries),
         )
-        (found,) = [one for one in follower.next(0.0) if one.tile == tile]
-        assert (found.version, found.notice) == (4_000_000_001, None)
+        with pytest.raises(NotSigned, match="does not fit"):
+            follower.next(0.0)
         events: list[WatchEvent] = []
         watch = TileWatch(scene.watcher, region, events.append)
-        assert not watch._is_proven(found, follower)
+        assert not watch._is_proven(NewVersion(LAYER, tile, 4_000_000_000, None), follower)
         scene.server.alter_catalog = None
         scene.publish("shard", content(tile, 2))
         (true,) = [one for one in follower.next(0.0) if one.tile == tile]
@@ -461,37 +472,34 @@ def test_attack_catalog_that_lies(scene: VersionScene) -> None:
 
 
 def test_attack_catalog_that_goes_back(scene: VersionScene, caplog: pytest.LogCaptureFixture) -> None:
-    """Its catalog goes back to an older version, or leaves a tile out; who has fetched the tile, or heard the shard's
-    notice of it, notices and counts it."""
-    tile, heard, other = scene.tile(1), scene.tile(2), scene.tile(3)
-    asking = TileServerClient(scene.watcher, LAYER, 10.0)
-    region = Region(prefix="")
-    assert len(list(asking.fetch([tile, other]))) == 2
+    """Its catalog is a true one of before; who has seen a newer one refuses it by name, and who has only fetched the
+    tile, or heard the shard's notice of it, notices and counts it."""
+    tile, heard = scene.tile(1), scene.tile(2)
+    region, asking = Region(prefix=""), TileServerClient(scene.watcher, LAYER, 10.0)
+    old = scene.store.catalog(LAYER, FIRST.district)
     scene.publish("shard", content(tile, 4))
-    first = {one.tile: one for one in asking.catalog(region)}
-    assert first[tile].version == 2
-    assert asking.behind == {}
-    list(asking.fetch([tile]))
+    new_tile = scene.tile(3)
+    assert len(list(asking.fetch([tile, new_tile]))) == 2
     new = stored(scene, heard)
     made_s = new.created_ns // 10**9 + 1
     asking.note_announced(TileUpdate(heard, LAYER, 2, 1, bytes(32), new.sha, "base", made_s=made_s, put_count=1))
     before = refusals()
-    old = {tile: replace(first[tile], version=1, sha=stored(scene, tile, 1).sha)}
-    scene.server.alter_catalog = lambda said: Catalog(
-        tuple(old.get(one.tile, one) for one in said.entries if one.tile != other)
-    )
+    scene.server.alter_catalog = lambda _said: old
     with caplog.at_level("WARNING"):
         asking.catalog(region)
-    assert asking.behind == {tile: 1, heard: 1, other: None}
+    assert asking.behind == {tile: 1, heard: 1, new_tile: None}
     assert "goes back behind what was seen of 3 tiles" in caplog.text
-    for reason, n in (("older", 2), ("left out", 1)):
-        assert refusals()["catalog", reason] - before.get(("catalog", reason), 0) == n
     scene.server.alter_catalog = None
-    asking.catalog(region)
+    assert asking.catalog(region)[-1].tile == new_tile
     assert asking.behind == {heard: 1}, "the notice's version has not come"
+    scene.server.alter_catalog = lambda _said: old
+    with pytest.raises(NotSigned, match=r"number \d+ was signed \d+ s before number \d+, which was seen before"):
+        asking.catalog(region)
+    assert list(asking.refused) == [FIRST.district]
+    for reason, n in (("older", 4), ("left out", 1)):  # two tiles, one of them twice, and a catalog are older
+        assert refusals()["catalog", reason] - before.get(("catalog", reason), 0) == n
     on_trial = TileServerClient(scene.watcher, LAYER, 10.0, newest=True)
-    list(on_trial.fetch([tile, other]))
-    scene.server.alter_catalog = lambda said: Catalog(tuple(old.get(one.tile, one) for one in said.entries))
+    list(on_trial.fetch([tile]))
     on_trial.catalog(region)
     assert on_trial.behind == {}, "a catalog names what is released"
 

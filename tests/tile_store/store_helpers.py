@@ -12,10 +12,14 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.report_id import deterministic_report_id
+from gnd.tile_store import sql_catalogs as catalogs
+from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.bodies import move_out, place_of_bodies
+from gnd.tile_store.connection import SqlConnection
 from gnd.tile_store.location import open_store
 from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.store import Store
+from gnd.tile_store.trials import TrialTerms
 from gnd.tile_store.values import Basis, Claim, Publication, ReportRow, StoreConfig, TileWork
 
 TILE = TileId(497353963154)
@@ -148,3 +152,13 @@ def merge_once(store: Store, *voxels: int, owner: str = "m1") -> int:
     (result,) = store.publish([publication(store.load(only_claim(store, owner)), *voxels)])
     assert result.status == "published"
     return result.version
+
+
+def begin_trial(store: SqlStore, tile: TileId, terms: TrialTerms) -> None:
+    """Version 2 of a tile goes on trial, as when it is published."""
+
+    def work(c: SqlConnection, now: int) -> None:
+        with catalogs.changing(c, store.signing, "ndt", tile):
+            trials.begin(c, "ndt", tile, (1, 2), terms, now)
+
+    store.transact(work)

@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
-from store_helpers import EAST, FAR, TILE, Maker, of_a_file, tile_of_voxels
+from store_helpers import EAST, FAR, TILE, Maker, begin_trial, of_a_file, tile_of_voxels
 
 from gnd.fleet_bus.identity.authority import Authority
 from gnd.fleet_bus.identity.names import MemberName
@@ -234,7 +234,7 @@ def test_a_version_on_trial_is_not_published(maker: Maker, objects: FolderObject
     with maker.open() as store:
         for voxels in ((1,), (1, 2)):
             store.put_tiles([tile_of_voxels(TILE, *voxels)])
-        store.transact(lambda c, now: trials.begin(c, "ndt", TILE, (1, 2), TrialTerms(0.5, 3600.0), now))
+        begin_trial(store, TILE, TrialTerms(0.5, 3600.0))
         publish(store, objects, ["ndt"])
         assert index_of(objects).by_tile[TILE].version == 1
         assert publish(store, objects, ["ndt"]).objects == 0

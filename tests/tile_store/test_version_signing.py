@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from store_helpers import EAST, TILE, Clock, Maker, tile_of_voxels
+from store_helpers import EAST, TILE, Clock, Maker, begin_trial, tile_of_voxels
 
 from gnd.deploy.map_cli import map_group
 from gnd.fleet_bus.errors import IdentityError, NotAnsweredFor
@@ -76,7 +76,7 @@ def test_a_withdrawn_trial_is_followed_by_a_signed_rollback(maker: Maker, folder
         for voxels in ((1,), (1, 2)):
             store.put_tiles([tile_of_voxels(TILE, *voxels)])
         terms = TrialTerms(0.5, 3600.0)
-        store.transact(lambda c, now: trials.begin(c, "ndt", TILE, (1, 2), terms, now))
+        begin_trial(store, TILE, terms)
         (trial,) = store.trials("ndt").values()
         assert releasing.withdraw(store, trial, "shard s1", "vehicles fared badly")
         newest = store.get("ndt", TILE)

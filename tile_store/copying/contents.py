@@ -22,6 +22,7 @@ _REPORT: Final = (*_TILE, "report_id")
 ALL: Final = (
     Contents("tile_version", _VERSION),
     Contents("tile_head", _TILE),
+    Contents("catalog_state", _TILE),
     Contents("notice", _VERSION),
     Contents("report", ("arrival",)),
     Contents("journal", _TILE),
@@ -116,6 +117,7 @@ OF_DISTRICT: Final = (
         ("state", "body", "wanted", "journal_id", "report_id"),
     ),
     DistrictPart(_KEYS["tile_head"], "late"),
+    DistrictPart(_KEYS["catalog_state"], "late"),
     DistrictPart(_KEYS["survey"], "late"),
     DistrictPart(_KEYS["journal"], "late"),
     DistrictPart(_KEYS["dirty"], "late", guarded=("seq", "waiting")),

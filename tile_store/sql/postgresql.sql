@@ -520,6 +520,21 @@ CREATE TABLE border_row (
 );
 CREATE INDEX border_row_received ON border_row (received_ns);
 
+-- name: schema_of_catalogs
+-- Step 19, likewise.
+CREATE TABLE catalog_state (
+  layer     text COLLATE "C" NOT NULL,
+  tile      bigint NOT NULL CHECK (tile % 1024 = 0),
+  tiles     bigint NOT NULL CHECK (tiles BETWEEN 1 AND 1024),
+  digests   bytea  NOT NULL CHECK (length(digests) = 1024),
+  number    bigint NOT NULL CHECK (number > 0),
+  signed_s  bigint NOT NULL,
+  kind      text COLLATE "C" NOT NULL CHECK (kind IN ('published', 'rollback', 'renewed', 'whole')),
+  signer    bytea  NOT NULL CHECK (length(signer) = 8),
+  signature bytea  NOT NULL CHECK (length(signature) = 64),
+  PRIMARY KEY (layer, tile)
+);
+
 -- name: store_lock
 SELECT store_lock(:store::integer, :alone <> 0, :parts::bigint[]::integer[])
 

@@ -1828,3 +1828,50 @@ ON CONFLICT (district) DO UPDATE SET region = excluded.region, state = excluded.
 -- name: state_of_district
 SELECT COALESCE((SELECT state FROM district_owner WHERE district = :district),
                 (SELECT state FROM district_owner WHERE district = -1), 'owned')
+
+-- name: schema_of_catalogs
+-- Step of the schema. What a publisher has signed of the released versions of a district (`gnd.schemas.catalog_signature`):
+-- `tile` is the first of the district, `tiles` how many there are, `digests` those of its groups.
+CREATE TABLE catalog_state (
+  layer     TEXT    NOT NULL,
+  tile      INTEGER NOT NULL CHECK (tile % 1024 = 0),
+  tiles     INTEGER NOT NULL CHECK (tiles BETWEEN 1 AND 1024),
+  digests   BLOB    NOT NULL CHECK (length(digests) = 1024),
+  number    INTEGER NOT NULL CHECK (number > 0),
+  signed_s  INTEGER NOT NULL,
+  kind      TEXT    NOT NULL CHECK (kind IN ('published', 'rollback', 'renewed', 'whole')),
+  signer    BLOB    NOT NULL CHECK (length(signer) = 8),
+  signature BLOB    NOT NULL CHECK (length(signature) = 64),
+  PRIMARY KEY (layer, tile)
+) STRICT;
+
+-- name: catalog_state
+SELECT tiles, digests, number, signed_s, kind, signer, signature FROM catalog_state
+WHERE layer = :layer AND tile = :tile
+
+-- name: put_catalog_state
+INSERT INTO catalog_state (layer, tile, tiles, digests, number, signed_s, kind, signer, signature)
+VALUES (:layer, :tile, :tiles, :digests, :number, :signed_s, :kind, :signer, :signature)
+ON CONFLICT (layer, tile) DO UPDATE SET tiles = excluded.tiles, digests = excluded.digests, number = excluded.number,
+  signed_s = excluded.signed_s, kind = excluded.kind, signer = excluded.signer, signature = excluded.signature
+
+-- name: forget_catalog_state
+DELETE FROM catalog_state WHERE layer = :layer AND tile = :tile
+
+-- name: places_of_catalogs
+SELECT tile / 1024 FROM catalog_state WHERE layer = :layer
+
+-- name: catalogs_signed_before
+SELECT tile FROM catalog_state WHERE layer = :layer AND signed_s < :before ORDER BY signed_s, tile LIMIT :n
+
+-- name: signers_of_catalogs
+SELECT DISTINCT signer FROM catalog_state WHERE layer = :layer
+
+-- name: catalogs_of_signer
+SELECT tile / 1024 FROM catalog_state WHERE layer = :layer AND signer = :signer
+
+-- name: any_head
+SELECT 1 FROM tile_head WHERE layer = :layer AND tile >= :first AND tile < :end LIMIT 1
+
+-- name: newest_of_district
+SELECT tile, MAX(version) FROM tile_version WHERE layer = :layer AND tile >= :first AND tile < :end GROUP BY tile

@@ -1,0 +1,79 @@
+"""Signs the catalogs of the districts that this shard owns: those for which nobody answers, and all again in time."""
+
+import logging
+import math
+import time
+from typing import Final
+
+from gnd.cloud_merger.ownership import Members
+from gnd.fleet_bus.publishers import Publishers
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import District
+from gnd.tile_store.catalogs import (
+    RENEWED_AFTER_S,
+    SIGNED_TOGETHER,
+    DueCatalogs,
+    due_catalogs,
+    renew_catalogs,
+    sign_whole_catalog,
+)
+from gnd.tile_store.errors import StoreClosed
+from gnd.tile_store.sqlite_store import SqlStore
+
+SIGN_EVERY_S: Final = 5.0
+FAILED_AGAIN_S: Final = 60.0
+"""A district that is not to be signed is looked at again after so long: all its versions are."""
+_LOG = logging.getLogger(__name__)
+
+
+class CatalogSigner:
+    """Looks now and then for districts whose catalogs are to be signed.
+
+    Args:
+        store: opened with an identity.
+        members: whose district it is; that of a shard that has died falls to another.
+        publishers: whose signatures count.
+        renewed_after_s: a catalog that was signed so long ago is signed again, s.
+    """
+
+    def __init__(
+        self, store: SqlStore, members: Members, publishers: Publishers, renewed_after_s: float = RENEWED_AFTER_S
+    ) -> None:
+        self._store, self._members, self._publishers = store, members, publishers
+        self._renewed_after_s = renewed_after_s
+        self._failed_s: dict[tuple[str, District], float] = {}
+
+    def work(self) -> int:
+        """Sign what is due, of each layer no more than some districts; how many were."""
+        before_s, n = time.time() - self._renewed_after_s, 0
+        for due in due_catalogs(self._store, self._publishers, self._members.is_mine, before_s):
+            try:
+                n += renew_catalogs(self._store, due.layer, due.renewed)
+            except StoreClosed:
+                raise
+            except GndError as error:  # a district that moves away, a certificate that has ended: the next look tells
+                _LOG.warning("catalogs of layer %s are not signed again: %s", due.layer, error)
+            n += self._whole(due)
+        return n
+
+    def _whole(self, due: DueCatalogs) -> int:
+        n, now_s = 0, time.monotonic()
+        again_s = {place: at_s for place, at_s in self._failed_s.items() if at_s > now_s}
+        wanted = [one for one in due.whole if again_s.get((due.layer, one), -math.inf) <= now_s]
+        for district in wanted[:SIGNED_TOGETHER]:
+            why = self._signed(due.layer, district)
+            n += not why
+            if why:
+                again_s[due.layer, district] = now_s + FAILED_AGAIN_S
+                _LOG.warning("the catalog of district %s of layer %s is not signed: %s", district, due.layer, why)
+        self._failed_s = again_s
+        return n
+
+    def _signed(self, layer: str, district: District) -> str:
+        """Sign a district; why it is not signed, "": it is."""
+        try:
+            return sign_whole_catalog(self._store, layer, district)
+        except StoreClosed:
+            raise
+        except GndError as error:
+            return str(error)
