@@ -2,9 +2,13 @@
 
 import logging
 import math
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
+from gnd.cloud_merger.expander_threads import working
 from gnd.cloud_merger.ownership import Members
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.errors import GndError
@@ -18,12 +22,24 @@ from gnd.tile_store.catalogs import (
     sign_whole_catalog,
 )
 from gnd.tile_store.errors import StoreClosed
+from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqlStore
 
 SIGN_EVERY_S: Final = 5.0
 FAILED_AGAIN_S: Final = 60.0
 """A district that is not to be signed is looked at again after so long: all its versions are."""
 _LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def signing_catalogs(store: SqlStore, members: Members, signing: Signing | None) -> Iterator[None]:
+    """Sign catalogs in a thread while the block runs; who has no identity signs nothing."""
+    if signing is None:
+        yield
+        return
+    signer = CatalogSigner(store, members, signing.publishers)
+    with working(signer.work, threading.Event(), 1, SIGN_EVERY_S):
+        yield
 
 
 class CatalogSigner:

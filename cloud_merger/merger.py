@@ -8,7 +8,7 @@ from typing import Final
 
 from gnd.cloud_merger.admission import Admission
 from gnd.cloud_merger.announce import Announcer
-from gnd.cloud_merger.catalog_signer import SIGN_EVERY_S, CatalogSigner
+from gnd.cloud_merger.catalog_signer import signing_catalogs
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import Expander
 from gnd.cloud_merger.expander_threads import working
@@ -149,9 +149,7 @@ def run_worker(
         HealthCollector(store).open(bus)
         keeper = ReleaseKeeper(store, members)
         stack.enter_context(working(keeper.work, threading.Event(), 1, KEEP_EVERY_S))
-        if signing is not None:  # what the districts hold is signed anew in time, and where nobody answers for it
-            signer = CatalogSigner(store, members, signing.publishers)
-            stack.enter_context(working(signer.work, threading.Event(), 1, SIGN_EVERY_S))
+        stack.enter_context(signing_catalogs(store, members, signing))
 
         worker, announcer = Worker(store, config, bases), Announcer(store, bus, members, bases)
         while not stop.is_set():

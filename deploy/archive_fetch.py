@@ -14,7 +14,7 @@ from gnd.tile_client.archive import Archive
 from gnd.tile_client.archive_check import ArchiveCheck, SeenStates
 from gnd.tile_client.checking import SeenVersion, VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveStale
-from gnd.tile_store.mirroring import MirroredTile, check_mirror, mirror
+from gnd.tile_store.mirroring import MirroredTile, check_mirror, mirror, mirror_catalog
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import NS_PER_S
 
@@ -143,8 +143,17 @@ class ArchiveFetcher:
                     self._keep(layer, came)
         finally:
             self._keep(layer, came)
+        self._keep_catalog(layer, index)
         self.done.tiles += len(entries)
         self.done.unchanged += len(entries) - len(wanted)
+
+    def _keep_catalog(self, layer: str, index: ArchiveIndex) -> None:
+        """Who answers for the catalog is kept where the whole district is here as it was signed."""
+        signed, publishers, district = index.catalog, self._publishers, index.district
+        if signed is None or publishers is None or self._store.catalog(layer, district).signature == signed:
+            return
+        chain = self._store.publisher_chain(signed.signer) or self._chain(signed.signer)
+        mirror_catalog(self._store, publishers, layer, district, signed, chain)
 
     def _wanted(
         self, layer: str, entries: Sequence[ArchiveEntry], held: dict[TileId, CatalogEntry]

@@ -123,7 +123,7 @@ class ArchiveIndex:
     layer: str
     district: District
     entries: tuple[ArchiveEntry, ...] = ()
-    catalog: CatalogSignature | None = None
+    catalog: CatalogSignature | None = field(default=None, compare=False)
     """Of who answers for the district's catalog on the bus; None: nobody does."""
     sealed: Sealed | None = field(default=None, compare=False)
     """Its seal, of one that was read; None: nobody answers for it."""

@@ -44,19 +44,21 @@ class CatalogCheck:
         self._publishers, self._layer, self._oldest_s = publishers, layer, oldest_s
         self._seen = SeenStates() if seen is None else seen
 
-    def check(self, district: District, catalog: Catalog) -> None:
-        """Take note of the catalog that came for a district.
+    def check(self, layer: str, district: District, catalog: Catalog) -> None:
+        """Take note of the catalog that came under the key of a layer and a district.
 
         Raises:
             NotSigned: it is not to be used; why. It is counted (`gnd_refusals`, kind "catalog").
         """
         try:
-            self._check(district, catalog)
+            self._check(layer, district, catalog)
         except _RefusedCatalogError as refused:
             counted("catalog", refused.reason)
             raise NotSigned(f"catalog of district {district} of layer {self._layer}: {refused}") from refused
 
-    def _check(self, district: District, catalog: Catalog) -> None:
+    def _check(self, layer: str, district: District, catalog: Catalog) -> None:
+        if layer != self._layer:
+            raise _RefusedCatalogError("wrong", f"is that of layer {layer[:40]}")
         newest, signed = self._seen.newest(self._name(district)), catalog.signature
         if signed is None:
             if not catalog.entries and newest == SealNumber():

@@ -92,9 +92,7 @@ class TileServerClient:
             return catalog.entries
         layer, district = parse_catalog_key(key)
         try:
-            if layer != self.layer:
-                raise NotSigned(f"asked for catalogs of layer {self.layer}, got one of layer {layer}")
-            self._catalogs.check(district, catalog)
+            self._catalogs.check(layer, district, catalog)
         except NotSigned as error:
             self.refused[district] = str(error)
             _SELDOM.warning("%s", error)

@@ -7,9 +7,12 @@ first had sent it.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gnd.fleet_bus.errors import SealError
+from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.content import AnyTile, day_of_tile
 from gnd.gnd_map.day import UNKNOWN_DAY, ns_of
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.catalog_signature import CatalogSignature, CatalogStatement
 from gnd.schemas.tiles import TileBlob
 from gnd.schemas.version_signature import VersionSignature
 from gnd.tile_store import sql_catalogs as catalogs
@@ -59,6 +62,37 @@ def mirror(store: SqlStore, layer: str, tiles: Sequence[MirroredTile]) -> None:
             _put(c, layer, one, now)
 
     store.transact(work)
+
+
+def mirror_catalog(
+    store: SqlStore, publishers: Publishers, layer: str, district: District, signature: CatalogSignature, chain: bytes
+) -> bool:
+    """Keep who answers for the catalog of a district; False: it does not fit what is here, where a part is missing or
+    newer, and is not kept.
+
+    Args:
+        store: a mirror.
+        publishers: whose signatures count.
+        layer: of the map.
+        district: of the layer.
+        signature: of the catalog.
+        chain: the certificates behind it.
+    """
+
+    def work(c: SqlConnection, _now: int) -> bool:
+        here = CatalogStatement.of(layer, district, catalogs.released_of(c, layer, district))
+        state = catalogs.CatalogState(here, signature)
+        if catalogs.state_of(c, layer, district) == state:
+            return True
+        post(c, "put_publisher", {"signer": signature.signer, "chain": chain, "since_s": signature.signed_s})
+        try:
+            catalogs.who_signed_catalog(c, publishers, state)
+        except SealError:
+            return False
+        catalogs.keep(c, state)
+        return True
+
+    return store.transact(work)
 
 
 def _put(c: SqlConnection, layer: str, one: MirroredTile, now: int) -> None:

@@ -13,11 +13,12 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import groupby
 from typing import Final
 
+from gnd.fleet_bus.errors import SealError
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.archive import (
@@ -37,10 +38,11 @@ from gnd.schemas.archive import (
     place_of_index,
 )
 from gnd.schemas.archive_seal import ARCHIVE_ID_BYTES, Sealed, SealedPart, digest_of_index, with_seal
+from gnd.schemas.catalog_signature import CatalogSignature, CatalogStatement
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.limits import MAX_ARCHIVE_INDEX_BYTES, MAX_ARCHIVE_ROOT_BYTES, MAX_PACK_BYTES
 from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
-from gnd.schemas.tiles import CatalogEntry, TileReply
+from gnd.schemas.tiles import Catalog, CatalogEntry, TileReply
 from gnd.tile_store.connection import fetch
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.objects import FolderObjects, NamedObjects
@@ -56,6 +58,8 @@ LEAST_LIVE: Final = 0.5
 """So is one of whose packs less than this share is still named."""
 PRUNED_AFTER_S: Final = 3600.0
 """What nothing names stays for so long: a publisher may be about to name it, a reader hold an index that does."""
+CATALOG_SHOWN_S: Final = 6 * 3600
+"""A mirror may show a catalog's signature that is so much older than the newest one, s."""
 _DISTRICT_DIGITS: Final = 15
 _LOG = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
@@ -203,7 +207,11 @@ class _Writing:
     def district(self, layer: str, district: District, heads: Sequence[CatalogEntry], done: Published) -> None:
         """Write what is new of a district, then its index, where anything is."""
         name = index_name(layer, district)
-        before = self._published(name)
+        before, catalog = self._published(name), self._store.catalog(layer, district)
+        why = self._not_as_signed(layer, district, catalog)
+        if why:  # what was published stays: the seal of who publishes would make it ours
+            done.damaged[f"{layer} {district.path}"] = why
+            return
         signed = self._signed(layer, district)
         held = {} if before is None else dict(before.by_tile)
         kept = {head.tile: held[head.tile] for head in heads if _is_same(held.get(head.tile), head, signed)}
@@ -216,14 +224,38 @@ class _Writing:
             kept = dict(index.by_tile)
         else:
             index = before
+        index = replace(index, catalog=self._shown(catalog) if catalog.entries == tuple(heads) else None, sealed=None)
         self._write_index(name, index, before, done)
         done.unsigned += sum(entry.signed == UNSIGNED for entry in kept.values())
+
+    def _not_as_signed(self, layer: str, district: District, catalog: Catalog) -> str:
+        """Why a publisher's signature under a catalog does not fit what is in the store; "": it does, or there is
+        none, or nobody looks.
+        """
+        signed = catalog.signature
+        if signed is None or self._signing is None:
+            return ""
+        publishers = self._signing.publishers
+        try:
+            if not publishers.knows(signed.signer):
+                publishers.learn(self._store.publisher_chain(signed.signer) or b"")
+            text = signed.text(CatalogStatement.of(layer, district, catalog.entries))
+            publishers.check(signed.signer, signed.signed_s, text, signed.signature)
+        except SealError as error:
+            return f"the catalog is not as it was signed (`gnd map verify --signatures`): {error}"
+        return ""
+
+    def _shown(self, catalog: Catalog) -> CatalogSignature | None:
+        """The signature under a catalog, its certificates beside it."""
+        if catalog.signature is not None:
+            self._put_certificate(catalog.signature.signer, self._store.publisher_chain(catalog.signature.signer))
+        return catalog.signature
 
     def _write_index(self, name: str, index: ArchiveIndex, before: ArchiveIndex | None, done: Published) -> None:
         """Write an index where it, or who answers for it, has changed."""
         sealed = None if before is None else before.sealed
         is_good = self._signing is None or self._is_ours(sealed)
-        if index != before or not is_good:
+        if index != before or not is_good or _is_outdated(before.catalog, index.catalog):
             body = index.encode()
             self._digests[index.layer, index.district] = digest_of_index(sha256(body).digest())
             data = self._sealed("index", body, sealed if is_good else None, MAX_ARCHIVE_INDEX_BYTES)
@@ -368,6 +400,15 @@ def _is_same(entry: ArchiveEntry | None, head: CatalogEntry, signed: dict[TileId
         return False
     told = entry.version, entry.hash, entry.signed
     return told == (head.version, head.sha[:ANSWER_HASH_BYTES], signed.get(head.tile, UNSIGNED))
+
+
+def _is_outdated(before: CatalogSignature | None, now: CatalogSignature | None) -> bool:
+    """Whether an index that says the same is written anew for who answers for the catalog: seldom, for shards sign it
+    again once an hour.
+    """
+    if before is None or now is None:
+        return before is not now
+    return now.signer != before.signer or now.signed_s - before.signed_s > CATALOG_SHOWN_S
 
 
 def _is_scattered(kept: Sequence[ArchiveEntry]) -> bool:

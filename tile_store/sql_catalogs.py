@@ -148,8 +148,8 @@ def _is_there(before: CatalogState, tile: TileId, had: Sequence[CatalogEntry]) -
     is_there = digest_at(before.statement.digests, group_of(tile)) == digest_of_group(had)
     if not is_there:
         _SELDOM.warning(
-            "%s names other versions beside tile %s than are there, and is not signed any more: the store was changed by"
-            " hand, or by a program of an older release; see `gnd map verify --signatures`",
+            "%s names other versions beside tile %s than are there, and is not signed any more: the store was changed"
+            " by hand, or by a program of an older release; see `gnd map verify --signatures`",
             before.name,
             tile.path,
         )

@@ -38,6 +38,7 @@ from gnd.tile_client.archive_check import SeenStates
 from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
 from gnd.tile_client.http_reader import PATIENT, Patience
+from gnd.tile_store import sql_catalogs as catalogs
 from gnd.tile_store.objects import FolderObjects
 from gnd.tile_store.publishing import publish
 from gnd.tile_store.signing import Signing
@@ -148,6 +149,10 @@ def forged(scene: ArchiveScene, signer: str | None) -> FetchedArchive:
     with SqliteStore(scene.folder / "forged.sqlite", signing=signing) as store:
         for seed in (1, 2, 3):
             store.put_tiles([content(tile, 1000 + seed) for tile in TILES])
+        if signer is not None:  # an operator's own look: the catalog is not that of a publisher
+            done = publish(store, objects, [LAYER], signing=Signing(scene.parts["operator"]))
+            assert (done.written, list(done.damaged)) == (0, [f"{LAYER} {FIRST.district.path}"])
+            store.transact(lambda c, _now: catalogs.forget(c, LAYER, FIRST.district))
         publish(store, objects, [LAYER], signing=Signing(scene.parts["operator"]))
     scene.serve(objects)
     return scene.fetch()

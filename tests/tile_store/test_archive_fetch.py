@@ -25,6 +25,7 @@ from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
 from gnd.tile_client.http_reader import HttpReader
 from gnd.tile_store.errors import StoreError
+from gnd.tile_store.catalogs import answered_catalogs
 from gnd.tile_store.objects import FolderObjects
 from gnd.tile_store.publishing import prune, publish
 from gnd.tile_store.signatures import signatures
@@ -74,6 +75,8 @@ def test_a_mirror_has_what_was_published_with_its_signatures(
             assert ours is not None
             assert theirs is not None
             assert (ours.to_blob(), ours.signature) == (theirs.to_blob(), theirs.signature)
+            assert mirror.catalog("ndt", tile.district) == store.catalog("ndt", tile.district)
+        assert {one.status for one in answered_catalogs(mirror, Publishers(parts / "v1"), "ndt")} == {"good"}
 
 
 def test_a_mirror_is_brought_up_to_date_with_few_requests(
@@ -94,6 +97,7 @@ def test_a_mirror_is_brought_up_to_date_with_few_requests(
         done = fetched(served, mirror, parts)
         assert (done.fetched, done.unchanged, done.wrong) == (1, 30, {})
         assert mirror.heads() == store.heads()
+        assert mirror.catalog("ndt", TILE.district) == store.catalog("ndt", TILE.district)
         assert [line.version for line in mirror.history("ndt", TILES[5])] == [1, 2]
 
 
@@ -108,6 +112,8 @@ def test_only_the_tiles_of_a_region_are_read(
         assert [head.tile for head in mirror.heads()] == [TILES[3]]
         fetcher.fetch(("ndt",), Region(FAR.district.path))
         assert [head.tile for head in mirror.heads()] == [FAR, TILES[3]]
+        signed = [mirror.catalog("ndt", tile.district).signature for tile in (FAR, TILES[3])]
+        assert [one is not None for one in signed] == [True, False], "of a part of a district nobody has signed a list"
         stored = [mirror.get("ndt", tile) for tile in (FAR, TILES[3])]
         told = {path: n for path, (_, n) in ledger.by_tile().items()}
         assert told.keys() == {FAR.path, TILES[3].path}

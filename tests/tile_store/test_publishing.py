@@ -25,7 +25,6 @@ from gnd.schemas.archive import (
 )
 from gnd.schemas.archive_seal import Sealed, digest_of_index
 from gnd.schemas.tiles import TileReply, content_of
-from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.errors import StoreBusy, StoreError, StoreUnavailable
 from gnd.tile_store.location import open_store
 from gnd.tile_store.objects import FolderObjects, NamedObjects, ObjectSeen

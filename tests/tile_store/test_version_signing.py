@@ -17,7 +17,6 @@ from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE, MemberName
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.day import UNKNOWN_DAY, day_of
 from gnd.tile_store import releasing
-from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.errors import NotPublished
 from gnd.tile_store.location import open_store
 from gnd.tile_store.rollback import RollbackTarget, roll_back
