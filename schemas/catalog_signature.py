@@ -58,9 +58,14 @@ def digest_of_group(entries: Sequence[NamedVersion]) -> bytes:
     SHA-256 over a zero byte and of each tile: its Morton code (8 bytes), version (4), hash of its content (32); all
     integers little-endian.
     """
-    if not entries:
+    return digest_of_rows([(one.tile.morton, one.version, one.sha) for one in entries])
+
+
+def digest_of_rows(rows: Sequence[tuple[int, int, bytes]]) -> bytes:
+    """As `digest_of_group`, of Morton codes, versions and hashes."""
+    if not rows:
         return NO_TILES
-    told = (one.tile.morton.to_bytes(8, "little") + one.version.to_bytes(4, "little") + one.sha for one in entries)
+    told = [tile.to_bytes(8, "little") + version.to_bytes(4, "little") + sha for tile, version, sha in rows]
     return sha256(_GROUP + b"".join(told)).digest()
 
 

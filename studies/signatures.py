@@ -3,6 +3,7 @@
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
@@ -14,6 +15,8 @@ from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.content import encode_content_delta
 from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, TileId
+from gnd.schemas.catalog_signature import CatalogStatement
 from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.version_signature import VersionSignature
 from gnd.tile_store.answers import TileAnswers
@@ -23,6 +26,7 @@ from gnd.tile_store.values import StoredTile
 from studies.frame.measure import Figure, core_s
 
 CALLS = 400
+CATALOG_CALLS = 300
 ROUNDS = 9
 CHANGED_SHARE = 0.05
 
@@ -48,6 +52,7 @@ def run() -> list[Figure]:
             *_bytes(signed, tiles),
             Figure("signatures where nothing is new", float(unchanged - bare), "B", f"a reply of {bare} B in all"),
             *_work(signing, signed, Publishers(folder / "shard"), chain),
+            *_catalogs(folder, signing, tiles[0]),
             *_publications(folder, signing, tiles),
         ]
 
@@ -76,6 +81,34 @@ def _reply_where_nothing_is_new(store: SqliteStore) -> int:
     request = TilesRequest.of([HeldVersion(head.tile, head.version, head.sha) for head in here])
     reply = TileAnswers(store).many("ndt", heads[0].tile.district, request)
     return len(reply.encode())
+
+
+def _catalogs(folder: Path, signing: Signing, tile: Tile) -> list[Figure]:
+    """What the signature under the catalog of a full district weighs and costs: 1,024 small tiles."""
+    district, some = tile.tile_id.district, [tile.gaussians.take(np.arange(n)) for n in (4, 5, 6, 7)]
+    spent: dict[str, list[float]] = {}
+    for name, signs in (("plain", None), ("signed", signing)):
+        with SqliteStore(folder / f"full_{name}.sqlite", signing=signs) as store:
+            store.put_tiles([Tile(one, 1, some[-1]) for one in district.tiles()])
+            begins = [time.process_time()]
+            for n in range(CATALOG_CALLS):
+                store.put_tiles([Tile(TileId(district.first_morton + n % TILES_OF_DISTRICT), 1, some[n % 3])])
+                begins.append(time.process_time())
+            spent[name] = np.diff(begins).tolist()
+            catalog = store.catalog("ndt", district)
+            whole_s = core_s(lambda store=store: store.catalog("ndt", district))  # type: ignore[misc]
+    bytes_signed = len(catalog.encode())
+    statement_s = core_s(lambda: CatalogStatement.of("ndt", district, catalog.entries))
+    before, after = (1e6 * median(spent[name]) for name in ("plain", "signed"))
+    more = float(bytes_signed - len(replace(catalog, signature=None).encode()))
+    return [
+        Figure("signature of a catalog", more, "B", f"{100 * more / bytes_signed:.1f} % of one of 1,024 tiles"),
+        Figure("publishing into a full district, not signed", before, "us of CPU"),
+        Figure("publishing into a full district, version and catalog signed", after, "us of CPU",
+               f"{after - before:+.0f} us"),
+        Figure("reading a catalog of 1,024 tiles", 1e6 * whole_s, "us of CPU"),
+        Figure("computing the root of 1,024 tiles", 1e6 * statement_s, "us of CPU", "by a client, beside a check"),
+    ]  # fmt: skip
 
 
 def _whole(signed: Sequence[StoredTile]) -> list[TileAnswer]:

@@ -23,7 +23,7 @@ from gnd.schemas.catalog_signature import (
     CatalogSignature,
     CatalogStatement,
     digest_at,
-    digest_of_group,
+    digest_of_rows,
     group_of,
     with_group,
 )
@@ -58,21 +58,23 @@ class CatalogState:
         return f"the catalog of district {self.statement.district} of layer {self.statement.layer}"
 
 
-def released_between(c: SqlConnection, layer: str, first: int, end: int) -> list[CatalogEntry]:
-    """The newest released versions of the tiles from a Morton code to before another one, by tile."""
+_Released = tuple[int, int, bytes]
+"""Morton code of a tile, the newest released version, the hash of its content."""
+
+
+def _released_between(c: SqlConnection, layer: str, first: int, end: int) -> list[_Released]:
+    """What is released of the tiles from a Morton code to before another one, by tile."""
     rows = fetch(c, "heads", {"layer": layer, "first": first, "end": end})
-    open_trials = trials.open_between(c, layer, first, end) if rows else {}
-    entries = [CatalogEntry(TileId(tile), version, bytes(sha)) for tile, version, sha in rows]
-    return [
-        CatalogEntry(one.tile, trial.base_version, trial.base_sha) if (trial := open_trials.get(one.tile)) else one
-        for one in entries
-    ]
+    open_trials = trials.trials_between(c, layer, first, end) if rows else {}
+    before = {tile.morton: (tile.morton, one.base_version, one.base_sha) for tile, one in open_trials.items()}
+    return [before.get(tile) or (tile, version, bytes(sha)) for tile, version, sha in rows]
 
 
 def released_of(c: SqlConnection, layer: str, district: District) -> list[CatalogEntry]:
     """The newest released versions of a district's tiles, by tile."""
     first = district.first_morton
-    return released_between(c, layer, first, first + TILES_OF_DISTRICT)
+    rows = _released_between(c, layer, first, first + TILES_OF_DISTRICT)
+    return [CatalogEntry(TileId(tile), version, sha) for tile, version, sha in rows]
 
 
 def catalog_of(c: SqlConnection, layer: str, district: District) -> Catalog:
@@ -138,14 +140,14 @@ def changing(
     after = replace(
         statement,
         tiles=statement.tiles + len(has) - len(had),
-        digests=with_group(statement.digests, group_of(tile), digest_of_group(has)),
+        digests=with_group(statement.digests, group_of(tile), digest_of_rows(has)),
     )
     put(c, signing, after, kind, before)
 
 
-def _is_there(before: CatalogState, tile: TileId, had: Sequence[CatalogEntry]) -> bool:
+def _is_there(before: CatalogState, tile: TileId, had: Sequence[_Released]) -> bool:
     """Whether a tile's group is as it was signed."""
-    is_there = digest_at(before.statement.digests, group_of(tile)) == digest_of_group(had)
+    is_there = digest_at(before.statement.digests, group_of(tile)) == digest_of_rows(had)
     if not is_there:
         _SELDOM.warning(
             "%s names other versions beside tile %s than are there, and is not signed any more: the store was changed"
@@ -161,9 +163,9 @@ def _has_tiles(c: SqlConnection, layer: str, district: District) -> bool:
     return bool(fetch(c, "any_head", {"layer": layer, "first": first, "end": first + TILES_OF_DISTRICT}))
 
 
-def _group(c: SqlConnection, layer: str, tile: TileId) -> list[CatalogEntry]:
+def _group(c: SqlConnection, layer: str, tile: TileId) -> list[_Released]:
     first = tile.morton - tile.morton % TILES_OF_GROUP
-    return released_between(c, layer, first, first + TILES_OF_GROUP)
+    return _released_between(c, layer, first, first + TILES_OF_GROUP)
 
 
 def _before(c: SqlConnection, signing: Signing | None, layer: str, district: District) -> CatalogState | None:

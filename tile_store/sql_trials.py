@@ -34,10 +34,10 @@ def begin(c: SqlConnection, layer: str, tile: TileId, versions: tuple[int, int],
 
 def open_trials(c: SqlConnection, layer: str, prefix: str = "") -> dict[TileId, VersionTrial]:
     """The open trials of a region by tile."""
-    return open_between(c, layer, *morton_range(prefix))
+    return trials_between(c, layer, *morton_range(prefix))
 
 
-def open_between(c: SqlConnection, layer: str, first: int, end: int) -> dict[TileId, VersionTrial]:
+def trials_between(c: SqlConnection, layer: str, first: int, end: int) -> dict[TileId, VersionTrial]:
     """The open trials of the tiles from a Morton code to before another one, by tile."""
     rows = fetch(c, "open_trials", {"layer": layer, "first": first, "end": end})
     if not rows:

@@ -27,7 +27,7 @@ from gnd.fleet_bus.seal_keys import load_signer
 from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.catalog_signature import CatalogSignature, CatalogStatement
-from gnd.schemas.errors import NotSigned
+from gnd.schemas.errors import NotSigned, SchemaError
 from gnd.schemas.tiles import Catalog
 from gnd.tile_client.catalog_check import CatalogCheck
 from gnd.tile_client.fetching import TileServerClient
@@ -71,7 +71,9 @@ def signed_by(scene: VersionScene, folder: Path, said: Catalog, age_s: float = 0
     signer, true = load_signer(folder), said.signature
     assert true is not None
     scene.server.chains[signer.certificate_id.hex()] = signer.chain
-    at = CatalogSignature(number or true.number, round(time.time() - age_s), true.kind, signer.certificate_id, bytes(64))
+    at = CatalogSignature(
+        number or true.number, round(time.time() - age_s), true.kind, signer.certificate_id, bytes(64)
+    )
     text = at.text(CatalogStatement.of(LAYER, HOME, said.entries))
     return replace(said, signature=replace(at, signature=raw_signature(folder, text)))
 
@@ -189,9 +191,8 @@ def test_attack_catalog_that_is_nonsense(scene: VersionScene) -> None:
     good = true_catalog(scene).encode()
     for wrong in (good[:-1], good + b"\x1a\x02\x08\x00", good + b"\x1a\x02\x18\x09", good + b"\x1a\x03\x2a\x01\x00"):
         scene.server.alter_catalog = lambda _true, wrong=wrong: _Raw(wrong)  # type: ignore[misc]
-        with pytest.raises(Exception, match="Catalog|catalog") as raised:
+        with pytest.raises(SchemaError, match=r"[Cc]atalog"):
             fresh(scene).catalog(EVERYWHERE)
-        assert type(raised.value).__module__.startswith("gnd."), raised.value
 
 
 class _Raw(Catalog):
@@ -271,20 +272,23 @@ def test_attack_catalog_signed_with_a_key_rotated_away(scene: VersionScene, tmp_
 
 
 def test_attack_catalog_of_a_revoked_shard(scene: VersionScene) -> None:
-    """A shard was broken into and has signed a catalog without a tile; it is revoked, and within a second nothing counts
-    that it has signed, back-dated or not. What it had signed before is signed anew when an operator has looked."""
+    """A shard was broken into and has signed a catalog without a tile; it is revoked, and within a second nothing
+    counts that it has signed, back-dated or not."""
     gone, said = scene.authority.part("shard", "gone-catalogs"), true_catalog(scene)
     less = signed_by(scene, gone, replace(said, entries=said.entries[1:]), number=1000)
     scene.server.alter_catalog = lambda _true: less
     assert len(fresh(scene).catalog(EVERYWHERE)) == len(said.entries) - 1, "until somebody knows, it is a publisher"
     scene.authority.revoke(gone, *scene.parts.values())
-    end_s = time.monotonic() + 10.0
-    while True:
+
+    def why() -> str:
         try:
             fresh(scene).catalog(EVERYWHERE)
         except NotSigned as error:
-            assert "was revoked" in str(error)
-            break
+            return str(error)
+        return "taken"
+
+    end_s = time.monotonic() + 10.0
+    while "was revoked" not in why():
         assert time.monotonic() < end_s, "the list is not read"
         time.sleep(0.1)
     is_refused(scene, signed_by(scene, gone, replace(said, entries=said.entries[1:]), 1800.0), "was revoked")
@@ -323,10 +327,10 @@ def test_attack_head_set_back_in_the_store(scene: VersionScene, tmp_path: Path) 
 # ---- real processes
 
 
+@pytest.mark.slow
 def test_attack_shard_killed_while_a_catalog_is_due(scene: VersionScene, tmp_path: Path) -> None:
-    """A map from before signatures of catalogs: the first shard with a key signs it when it starts. One that is killed
-    (kill -9) at any time leaves what is signed or not signed, never a half, and the next one goes on; a real tile server
-    hands it out over TLS-free sessions with identities."""
+    """Of a map from before signatures of catalogs clients refuse the catalog until a shard with a key has signed it; one
+    that is killed (kill -9) as it starts is no hindrance: the next one signs, and a real tile server hands it out."""
     path, endpoint = tmp_path / "old.sqlite", f"tcp/127.0.0.1:{new_port()}"
     tiles = [TileId(FIRST.morton + 40 * n) for n in range(4)]
     with SqliteStore(path) as plain:
@@ -349,7 +353,7 @@ def test_attack_shard_killed_while_a_catalog_is_due(scene: VersionScene, tmp_pat
         killed.wait()
         running = shard(scene, path, endpoint, "k2")
         try:
-            end_s = time.monotonic() + 60.0
+            end_s = time.monotonic() + 120.0
             while store.catalog(LAYER, HOME).signature is None:
                 assert time.monotonic() < end_s, "no shard has signed the catalog"
                 time.sleep(0.1)

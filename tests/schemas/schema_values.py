@@ -15,6 +15,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile, TileDelta
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.archive import UNSIGNED, ArchiveEntry, ArchiveIndex, ArchiveRoot, Pack
+from gnd.schemas.catalog_signature import CatalogSignature
 from gnd.schemas.changes import ChangeAck, ChangeReport, TileChange
 from gnd.schemas.course import Course
 from gnd.schemas.doubt import Doubt, DoubtReason
@@ -150,6 +151,7 @@ NEXT = Tile(TILE, 4, snap(gaussians([-604, 7, 8], count=300), LATTICES["standard
 
 SIGNED = VersionSignature(b"signer-1", "merged", 1_764_000_000, 1_764_000_000, bytes(range(64)))
 SIGNED_LATER = VersionSignature(b"signer-2", "base", 1_763_000_000, 1_764_000_000, bytes(range(64, 128)))
+CATALOG_SIGNATURE = CatalogSignature(7, 1_764_000_000, "rollback", b"signer-1", bytes(range(64)))
 
 GOLDEN: dict[str, Any] = {
     "TileRequest-nothing_cached": TileRequest(codecs=(0,), deltas=False),
@@ -195,12 +197,14 @@ GOLDEN: dict[str, Any] = {
             ArchiveEntry(EAST, 2**32 - 1, OTHER_SHA[:4], b"sign", Pack(OTHER_SHA, 900), 100, 800),
         ),
     ),
+    "ArchiveIndex-catalog": ArchiveIndex("ndt", TILE.district, catalog=CATALOG_SIGNATURE),
     "ArchiveRoot-empty": ArchiveRoot(),
     "ArchiveRoot-two_layers": ArchiveRoot(
         {"ndt": (TileId(0).district, TILE.district), "signs": (TileId(TILE.morton + 1024).district,)}
     ),
     "Catalog-empty": Catalog(),
     "Catalog-two_tiles": Catalog((CatalogEntry(TILE, 3, SHA), CatalogEntry(EAST, 2**32 - 1, OTHER_SHA))),
+    "Catalog-signed": Catalog((CatalogEntry(TILE, 3, SHA),), CATALOG_SIGNATURE),
     "ChangeReport-two_tiles-with_and_without_base": report(),
     "ChangeReport-nothing_changed": report(tiles=(change(changed=Gaussians.empty()),)),
     "ChangeReport-nothing_observed": report(tiles=(change(changed=Gaussians.empty(), observed=np.empty(0, np.int32)),)),

@@ -24,8 +24,8 @@ from gnd.tile_client.archive import Archive, ArchiveTiles
 from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
 from gnd.tile_client.http_reader import HttpReader
-from gnd.tile_store.errors import StoreError
 from gnd.tile_store.catalogs import answered_catalogs
+from gnd.tile_store.errors import StoreError
 from gnd.tile_store.objects import FolderObjects
 from gnd.tile_store.publishing import prune, publish
 from gnd.tile_store.signatures import signatures
