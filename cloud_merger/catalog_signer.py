@@ -1,10 +1,9 @@
 """Signs the catalogs of the districts that this shard owns: those for which nobody answers, and all again in time."""
 
 import logging
-import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
 
@@ -16,7 +15,6 @@ from gnd.gnd_map.tile_id import District
 from gnd.tile_store.catalogs import (
     RENEWED_AFTER_S,
     SIGNED_TOGETHER,
-    DueCatalogs,
     due_catalogs,
     renew_catalogs,
     sign_whole_catalog,
@@ -61,28 +59,37 @@ class CatalogSigner:
 
     def work(self) -> int:
         """Sign what is due, of each layer no more than some districts; how many were."""
-        before_s, n = time.time() - self._renewed_after_s, 0
+        before_s, now_s, n = time.time() - self._renewed_after_s, time.monotonic(), 0
+        self._failed_s = {place: at_s for place, at_s in self._failed_s.items() if at_s > now_s}
         for due in due_catalogs(self._store, self._publishers, self._members.is_mine, before_s):
-            try:
-                n += renew_catalogs(self._store, due.layer, due.renewed)
-            except StoreClosed:
-                raise
-            except GndError as error:  # a district that moves away, a certificate that has ended: the next look tells
-                _LOG.warning("catalogs of layer %s are not signed again: %s", due.layer, error)
-            n += self._whole(due)
+            renewed = self._renewed(due.layer, self._left(due.layer, due.renewed))
+            n += len(renewed) + self._whole(due.layer, self._left(due.layer, due.whole))
         return n
 
-    def _whole(self, due: DueCatalogs) -> int:
-        n, now_s = 0, time.monotonic()
-        again_s = {place: at_s for place, at_s in self._failed_s.items() if at_s > now_s}
-        wanted = [one for one in due.whole if again_s.get((due.layer, one), -math.inf) <= now_s]
-        for district in wanted[:SIGNED_TOGETHER]:
-            why = self._signed(due.layer, district)
+    def _left(self, layer: str, districts: Sequence[District]) -> list[District]:
+        """Some of these that did not fail a moment ago."""
+        return [one for one in districts if (layer, one) not in self._failed_s][:SIGNED_TOGETHER]
+
+    def _renewed(self, layer: str, districts: list[District]) -> list[District]:
+        """Sign again; those for which nobody answers as a whole."""
+        try:
+            done = renew_catalogs(self._store, layer, districts)
+        except StoreClosed:
+            raise
+        except GndError as error:  # a district that moves away, a certificate that has ended: the next look tells
+            _LOG.warning("catalogs of layer %s are not signed again: %s", layer, error)
+            return []
+        self._whole(layer, [one for one in districts if one not in done])
+        return done
+
+    def _whole(self, layer: str, districts: list[District]) -> int:
+        n, again_s = 0, time.monotonic() + FAILED_AGAIN_S
+        for district in districts:
+            why = self._signed(layer, district)
             n += not why
             if why:
-                again_s[due.layer, district] = now_s + FAILED_AGAIN_S
-                _LOG.warning("the catalog of district %s of layer %s is not signed: %s", district, due.layer, why)
-        self._failed_s = again_s
+                self._failed_s[layer, district] = again_s
+                _LOG.warning("the catalog of district %s of layer %s is not signed: %s", district, layer, why)
         return n
 
     def _signed(self, layer: str, district: District) -> str:

@@ -118,8 +118,8 @@ def due_catalogs(
             if _is_revoked(c, publishers, bytes(signer)):
                 named = {"layer": layer, "signer": bytes(signer)}
                 missing |= {number for (number,) in fetch(c, "catalogs_of_signer", named)}
-        old = fetch(c, "catalogs_signed_before", {"layer": layer, "before": at_s, "n": SIGNED_TOGETHER})
-        again = [number for (tile,) in old if (number := tile // TILES_OF_DISTRICT) not in missing]
+        old = fetch(c, "catalogs_signed_before", {"layer": layer, "before": at_s})
+        again = (number for (number,) in old if number not in missing)
         return DueCatalogs(layer, _of_mine(sorted(missing), is_mine), _of_mine(again, is_mine))
 
     return store.look(lambda c: [due(c, layer) for (layer,) in fetch(c, "layers")])
@@ -138,8 +138,9 @@ def _is_revoked(c: SqlConnection, publishers: Publishers, signer: bytes) -> bool
     return publishers.is_revoked(signer)
 
 
-def renew_catalogs(store: SqlStore, layer: str, districts: Sequence[District]) -> int:
-    """Sign what is signed once more, with the time of now, all in one transaction; how many.
+def renew_catalogs(store: SqlStore, layer: str, districts: Sequence[District]) -> list[District]:
+    """Sign what is signed once more, with the time of now, all in one transaction; the districts for which somebody had
+    answered.
 
     Only signatures are looked at, no versions: who reads the catalog compares those.
 
@@ -148,16 +149,16 @@ def renew_catalogs(store: SqlStore, layer: str, districts: Sequence[District]) -
     """
     signing = _signing(store)
 
-    def work(c: SqlConnection, _now: int) -> int:
-        n = 0
+    def work(c: SqlConnection, _now: int) -> list[District]:
+        done = list[District]()
         for district in districts:
             before = catalogs.state_of(c, layer, district)
             if before is not None and _is_good(c, signing, before):
                 catalogs.put(c, signing, before.statement, "renewed", before)
-                n += 1
-        return n
+                done.append(district)
+        return done
 
-    return store.transact(work) if districts else 0
+    return store.transact(work) if districts else []
 
 
 def sign_whole_catalog(store: SqlStore, layer: str, district: District, *, unchecked: bool = False) -> str:

@@ -329,7 +329,7 @@ def test_attack_head_set_back_in_the_store(scene: VersionScene, tmp_path: Path) 
 
 @pytest.mark.slow
 def test_attack_shard_killed_while_a_catalog_is_due(scene: VersionScene, tmp_path: Path) -> None:
-    """Of a map from before signatures of catalogs clients refuse the catalog until a shard with a key has signed it; one
+    """A map from before signatures of catalogs: clients refuse its catalog until a shard with a key has signed it. One
     that is killed (kill -9) as it starts is no hindrance: the next one signs, and a real tile server hands it out."""
     path, endpoint = tmp_path / "old.sqlite", f"tcp/127.0.0.1:{new_port()}"
     tiles = [TileId(FIRST.morton + 40 * n) for n in range(4)]

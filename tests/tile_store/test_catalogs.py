@@ -228,7 +228,7 @@ def test_of_a_revoked_shard_nothing_is_built_upon(
     authority.copy_lists([folder / one for one in ("s1", "s2", "anna", "v1")])
     with open_store(maker.location, signing=Signing(folder / "s1")) as store:
         assert [one.status for one in answered(store, folder)] == ["revoked"]
-        assert renew_catalogs(store, "ndt", [HOME]) == 0
+        assert renew_catalogs(store, "ndt", [HOME]) == []
         publishers = Publishers(folder / "s1")
         (due,) = due_catalogs(store, publishers, lambda _district: True)
         assert (due.whole, due.renewed) == ((HOME,), ())

@@ -534,6 +534,7 @@ CREATE TABLE catalog_state (
   signature bytea  NOT NULL CHECK (length(signature) = 64),
   PRIMARY KEY (layer, tile)
 );
+CREATE INDEX catalog_state_signed ON catalog_state (layer, signed_s, signer);
 
 -- name: store_lock
 SELECT store_lock(:store::integer, :alone <> 0, :parts::bigint[]::integer[])

@@ -1844,6 +1844,7 @@ CREATE TABLE catalog_state (
   signature BLOB    NOT NULL CHECK (length(signature) = 64),
   PRIMARY KEY (layer, tile)
 ) STRICT;
+CREATE INDEX catalog_state_signed ON catalog_state (layer, signed_s, signer);
 
 -- name: catalog_state
 SELECT tiles, digests, number, signed_s, kind, signer, signature FROM catalog_state
@@ -1862,7 +1863,7 @@ DELETE FROM catalog_state WHERE layer = :layer AND tile = :tile
 SELECT tile / 1024 FROM catalog_state WHERE layer = :layer
 
 -- name: catalogs_signed_before
-SELECT tile FROM catalog_state WHERE layer = :layer AND signed_s < :before ORDER BY signed_s, tile LIMIT :n
+SELECT tile / 1024 FROM catalog_state WHERE layer = :layer AND signed_s < :before ORDER BY signed_s, tile
 
 -- name: signers_of_catalogs
 SELECT DISTINCT signer FROM catalog_state WHERE layer = :layer
