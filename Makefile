@@ -10,7 +10,7 @@ SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs extras bench studies schemas page lock sbom audit clean
+.PHONY: help setup fleet test quick check docs extras bench studies schemas page kernels wheel lock sbom audit clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -72,6 +72,12 @@ page/node_modules/.ready: page/package-lock.json
 
 page: page/node_modules/.ready  ## build the page of gnd serve from page/ (needs node 20): deploy/serve/page
 	cd page && npm run --silent check-types && npm run --silent build
+
+kernels: setup   ## compile all kernels ahead of time, into this checkout: programs then start without numba (minutes; needs a C compiler)
+	$(BIN)/gnd kernels build
+
+wheel: kernels   ## a wheel with these kernels, for this version of Python and this kind of machine: build/wheel
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
 
 TOOLS := build/tools
 $(TOOLS)/.ready:

@@ -65,6 +65,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "gnd.deploy.bench.command:bench",
         "What a vehicle costs on this machine: CPU, memory and start, by stage.",
     ),
+    "kernels": (
+        "gnd.deploy.kernels_cli:kernels",
+        "Which machine code runs here, and compiling it ahead of time.",
+    ),
     "completion": ("gnd.deploy.completion_cli:completion", "Tab completion for bash, zsh and fish."),
     "config": ("gnd.deploy.config_cli:config", "Show and check the settings of the programs."),
     "sim": ("gnd.fleet_sim.cli:sim", "Write and inspect simulated worlds and drives."),

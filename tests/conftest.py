@@ -49,7 +49,10 @@ def pytest_configure() -> None:
     started with is the custom of the system, and stays.
 
     While tests are collected nothing becomes garbage: to look for it takes a third of that time.
+
+    Tests are of the source, compiled by numba; those of tests/ahead of libraries. GND_KERNELS=FILE tests all on one.
     """
+    os.environ.setdefault("GND_KERNELS", "numba")
     gc.disable()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -126,7 +126,16 @@ def _driven(
 
 
 def _record_compiling(seconds: list[float]) -> None:
-    """Note how long each kernel takes that is compiled from here on, one within another counted once."""
+    """Note how long each kernel takes that is compiled from here on, one within another counted once.
+
+    Loads no numba: a vehicle whose kernels were compiled ahead of time needs none.
+    """
+    from gnd.gnd_map.jit import when_numba_loads
+
+    when_numba_loads(lambda: _listen(seconds))
+
+
+def _listen(seconds: list[float]) -> None:
     from numba.core import event
 
     class Outermost(event.Listener):

@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import gnd
+from gnd.ahead.library import KernelLibrary, UnfitLibrary, library_path, load
 from gnd.deploy.doctor.finding import Finding
 from gnd.extras import LEFT_OUT
+from gnd.gnd_map import jit
+from gnd.gnd_map.jit import LazyKernel
 
 _OLDEST: Final = (3, 11)
 _SHOWN: Final = 6
@@ -63,28 +66,44 @@ def extras() -> Finding:
 
 
 def kernels() -> Finding:
-    """Whether the machine code of the kernels lies on the disk, so that no command has to compile."""
-    found = [_is_compiled(function) for function in _functions()]
-    ready, known = sum(found), len(found)
-    says = f"{ready} of {known} are compiled for this Python"
-    if ready:  # no machine needs them all: how many depends on what runs here
+    """Whether there is machine code of the kernels, so that no command has to compile."""
+    known, library = all_kernels(), _library()
+    if isinstance(library, UnfitLibrary):
+        return Finding("kernels", "warning", f"not used: {library}", "gnd kernels build, or remove the file")
+    ahead = {one for one in known if library is not None and library.is_valid_for(one)}
+    cached = sum(is_cached(one.plain) for one in known if one not in ahead)
+    if library is not None and ahead:
+        says = f"compiled ahead of time: {len(ahead)} of {len(library.kernels)} in {library.path} are as their source"
+        return Finding("kernels", "ok", f"{says}; {cached} more in numba's cache")
+    says = f"{cached} of {len(known)} are compiled for this Python, in numba's cache"
+    if cached:  # no machine needs them all: how many depends on what runs here
         return Finding("kernels", "ok", says)
-    return Finding("kernels", "warning", says, "nothing: the first command compiles for a minute or two, once")
+    do = "nothing: the first command compiles for a minute or two, once; or gnd kernels build, with a C compiler"
+    return Finding("kernels", "warning", says, do)
 
 
-def _functions() -> tuple[Callable[..., Any], ...]:
+def _library() -> KernelLibrary | UnfitLibrary | None:
+    """The library that was compiled ahead of time, why it is not used, or None where there is none."""
+    path = library_path()
+    if path is None or not path.is_file():
+        return None
+    try:
+        return load(path)
+    except UnfitLibrary as error:
+        return error
+
+
+def all_kernels() -> tuple[LazyKernel, ...]:
     """The kernels of the parts that run in a fleet, as far as they are installed."""
-    from gnd.gnd_map.jit import kernel_functions
-
     for module in ("gnd.gnd_map.codec", "gnd.cloud_merger.warm", "gnd.vehicle_agent.warm"):
         try:
             __import__(module)
         except ImportError:  # an extra that is not installed; `extras` says so
             continue
-    return kernel_functions()
+    return jit.kernels()
 
 
-def _is_compiled(function: Callable[..., Any]) -> bool:
+def is_cached(function: Callable[..., Any]) -> bool:
     """Whether numba's index of a kernel is there and no older than the source.
 
     The file is `MODULE.NAME-LINE.pyXY.nbi`, beside the module or, where nothing can be written there, in a folder of

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner, Result
@@ -110,7 +111,7 @@ def test_kernels_without_machine_code_are_a_warning(tmp_path: Path, monkeypatch:
     source.write_text("import numba\n\n@numba.njit(cache=True)\ndef kernel(x):\n    return x + 1\n\nkernel(1)\n")
     scope: dict[str, object] = {}
     exec(compile("\n\n\ndef kernel(x):\n    return x + 1\n", str(source), "exec"), scope)
-    monkeypatch.setattr(programs, "_functions", lambda: (scope["kernel"],))
+    monkeypatch.setattr(programs, "all_kernels", lambda: (SimpleNamespace(plain=scope["kernel"]),))
     monkeypatch.setattr(programs, "_of_user", lambda: tmp_path / "nowhere")
     assert programs.kernels().state == "warning"
     subprocess.run([sys.executable, str(source)], check=True, cwd=tmp_path, env={"PATH": "/usr/bin:/bin"})

@@ -92,6 +92,7 @@ shards map.sqlite
 status map.sqlite
 features list map.sqlite
 doctor
+kernels status
 """
 
 
