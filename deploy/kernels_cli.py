@@ -139,6 +139,11 @@ def check(context: click.Context, as_json: bool) -> None:
     values: dict[str, Any] = json.loads(done)
     counted = f"{len(values['kernels'])} kernels, {sum(values['kernels'].values())} calls"
     lines = [f"{counted}: {'every bit as with numba' if not values['unequal'] else 'not equal'}"]
+    ours_us, numbas_us = (sum(one[k] for one in values["times_us"].values()) for k in (0, 1))
+    if numbas_us:
+        lines.append(
+            f"time of these calls: {ours_us / 1e3:.1f} ms, by numba for this processor {numbas_us / 1e3:.1f} ms"
+        )
     lines += [f"other bits than with numba: {name}" for name in values["unequal"]]
     lines += [f"not in the library: {name}" for name in values["by_numba"]]
     tell(values, as_json, *lines)

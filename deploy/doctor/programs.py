@@ -70,8 +70,8 @@ def kernels() -> Finding:
     known, library = all_kernels(), _library()
     if isinstance(library, UnfitLibrary):
         return Finding("kernels", "warning", f"not used: {library}", "gnd kernels build, or remove the file")
-    ahead = {one for one in known if library is not None and library.is_valid_for(one)}
-    cached = sum(is_cached(one.plain) for one in known if one not in ahead)
+    ahead = [one.plain for one in known if library is not None and library.is_valid_for(one)]
+    cached = sum(is_cached(one.plain) for one in known if one.plain not in ahead)
     if library is not None and ahead:
         says = f"compiled ahead of time: {len(ahead)} of {len(library.kernels)} in {library.path} are as their source"
         return Finding("kernels", "ok", f"{says}; {cached} more in numba's cache")

@@ -168,12 +168,12 @@ def _argument(given: Any) -> list[Any]:
             return [what, "", "", 0, 0, 0, "", []]
     if isinstance(given, types.Number):
         return ["s", "", "", 0, 0, 0, f"numpy:{as_dtype(given).type.__name__}", []]
-    if isinstance(given, types.BaseNamedTuple):
+    if isinstance(given, types.NamedTuple | types.NamedUniTuple):
         cls = given.instance_class
-        parts = [_argument(one) for one in given]
+        parts = [_argument(one) for one in given.types]
         return ["N", "", "", 0, 0, 0, f"{cls.__module__}:{cls.__qualname__}", parts]
-    if isinstance(given, types.BaseTuple):
-        return ["T", "", "", 0, 0, 0, "", [_argument(one) for one in given]]
+    if isinstance(given, types.Tuple | types.UniTuple):
+        return ["T", "", "", 0, 0, 0, "", [_argument(one) for one in given.types]]
     raise CannotBuild(f"an argument of type {given}")
 
 
@@ -184,9 +184,11 @@ def _slots(module: Any) -> dict[str, bytes]:
 
     slots = {}
     for variable in module.global_variables:
-        found = lookup_environment(variable.name) if variable.name.startswith(_ENVIRONMENT) else None
+        if not variable.name.startswith(_ENVIRONMENT):
+            continue
+        found = lookup_environment(variable.name)  # type: ignore[no-untyped-call]
         if found is not None:
-            slots[variable.name] = serialize.dumps(found.consts)
+            slots[variable.name] = serialize.dumps(found.consts)  # type: ignore[no-untyped-call]
     return slots
 
 
@@ -259,11 +261,12 @@ def _linked(folder: Path, entries: Sequence[Entry], manifest: dict[str, Any]) ->
     """
     from numba.pycc.cc import CC
 
-    (cc, cxx), own = compilers(), CC("_kernels", source_module=sys.modules[__name__])
+    cc, cxx = compilers()
+    numbas: Any = CC("_kernels", source_module=sys.modules[__name__])  # type: ignore[no-untyped-call]
     (folder / "table.h").write_text("\n".join(_table(entries, manifest)), encoding="ascii")
     (folder / "exported").write_text("{ global: PyInit__kernels; local: *; };", encoding="ascii")
-    mixin, *others = own._get_mixin_sources()
-    defines = [f"-D{name}={value}" for name, value in own._get_mixin_defines()]
+    mixin, *others = numbas._get_mixin_sources()
+    defines = [f"-D{name}={value}" for name, value in numbas._get_mixin_defines()]
     quoted = [f'-DPYCC_MIXIN="{mixin}"', f'-DGND_TABLE="{folder / "table.h"}"', *_of_cpu()]
     includes = [f"-I{sysconfig.get_path('include')}", f"-I{np.get_include()}"]
     objects = []

@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from gnd.gnd_map.jit import LazyKernel, record_calls
 
 CALLS: Final = 3
 """Calls of each kernel and tuple of types that are compared."""
+TIMES: Final = 7
+"""Each of these is timed so often, in turns; the shortest counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +28,14 @@ class Agreement:
         kernels: that were called in the library, by name: calls.
         unequal: those whose results, or arguments after the call, differ in any bit from numba's.
         by_numba: kernels that the scenes call and the library does not have.
+        times_us: by kernel, microseconds of its calls together: in the library, and compiled by numba for this
+            processor.
     """
 
     kernels: dict[str, int]
     unequal: tuple[str, ...]
     by_numba: tuple[str, ...]
+    times_us: dict[str, tuple[float, float]]
 
 
 def check(library: KernelLibrary, scenes: Sequence[str] = SCENES) -> Agreement:
@@ -55,6 +61,7 @@ def check(library: KernelLibrary, scenes: Sequence[str] = SCENES) -> Agreement:
 def _compared(library: KernelLibrary, calls: Sequence[tuple[LazyKernel, tuple[Any, ...]]]) -> Agreement:
     compared: Counter[str] = Counter()
     unequal, by_numba = [], set()
+    times_us: dict[str, tuple[float, float]] = {}
     for kernel, arguments in calls:
         ahead = library.compiled(kernel)
         ours, numbas = _copied(arguments), _copied(arguments)
@@ -66,7 +73,22 @@ def _compared(library: KernelLibrary, calls: Sequence[tuple[LazyKernel, tuple[An
         if _bits((found, ours)) != _bits((kernel.dispatcher(*numbas), numbas)):
             unequal.append(name_of(kernel))
             logging.getLogger(__name__).error("%s: other bits than numba's", name_of(kernel))
-    return Agreement(dict(compared), tuple(unequal), tuple(sorted(by_numba)))
+        before = times_us.get(name_of(kernel), (0.0, 0.0))
+        took = _timed((ahead, kernel.dispatcher), arguments)
+        times_us[name_of(kernel)] = (before[0] + took[0], before[1] + took[1])
+    return Agreement(dict(compared), tuple(unequal), tuple(sorted(by_numba)), times_us)
+
+
+def _timed(called: tuple[Any, Any], arguments: tuple[Any, ...]) -> list[float]:
+    """The shortest time of a call of each, microseconds; in turns, each with arguments of its own."""
+    best_ns = [2**62, 2**62]
+    for _ in range(TIMES):
+        for k, function in enumerate(called):
+            own = _copied(arguments)
+            begun_ns = time.perf_counter_ns()
+            function(*own)
+            best_ns[k] = min(best_ns[k], time.perf_counter_ns() - begun_ns)
+    return [round(one / 1e3, 2) for one in best_ns]
 
 
 def _copied(value: Any) -> Any:

@@ -88,7 +88,9 @@ def installed_library() -> KernelLibrary | None:
     if path is None or not path.is_file():
         return None
     try:
-        return load(path)
+        library = load(path)
+        logging.getLogger(__name__).info("%d kernels, compiled ahead of time: %s", len(library.kernels), path)
+        return library
     except UnfitLibrary as error:
         logging.getLogger(__name__).warning("kernels are compiled by numba: %s", error)
         return None
