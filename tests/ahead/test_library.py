@@ -15,7 +15,7 @@ import pytest
 
 from gnd.ahead import build as building
 from gnd.ahead.build import build_environment
-from gnd.ahead.library import KernelLibrary, UnfitLibrary, file_name, library_path, load, sealed
+from gnd.ahead.library import KernelLibrary, UnfitLibrary, _type_of, file_name, library_path, load, sealed
 from gnd.gnd_map.jit import kernel_of
 
 LIMITS = "FACTOR = 2.0\n"
@@ -31,6 +31,14 @@ OFFSET = 0.1
 class Grid(NamedTuple):
     step: float
     rows: int
+
+class Span(NamedTuple):
+    begin: float
+    end: float
+
+@kernel
+def length(span):
+    return span.end - span.begin
 
 @pasted
 def doubled(x):
@@ -63,7 +71,7 @@ def spin(steps):
 """
 SCENE = """
 import numpy as np
-from ahead_kernels import Grid, fill, spin, total
+from ahead_kernels import Grid, Span, fill, length, spin, total
 
 def warm_up():
     total(np.linspace(0.1, 1.7, 50), Grid(0.3, 2), 1)
@@ -71,6 +79,7 @@ def warm_up():
     fill(np.zeros(4, np.float32), 2.5, (np.float32(3.0), True))
     fill(np.zeros((3, 4), order="F")[0], 2.5, (4, False))
     spin(10)
+    length(Span(1.0, 3.0))
 """
 
 
@@ -92,7 +101,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = run(made, "-m", "gnd.ahead.build", str(made / "k.so"), "ahead_scene", **build_environment(made / "cache"))
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
-    assert (told["kernels"], told["entries"], told["left_out"]) == (3, 5, {})
+    assert (told["kernels"], told["entries"], told["left_out"]) == (4, 6, {})
     return made
 
 
@@ -240,6 +249,13 @@ CHANGES = {
     "a table": ("ahead_kernels", "[1, 2, 3]", "[1, 2, 4]", {"total"}),
     "a constant elsewhere": ("ahead_limits", "2.0", "2.5", {"total"}),
     "fields of an argument": ("ahead_kernels", "rows: int", "lines: int", {"total"}),
+    "the order of fields": (
+        "ahead_kernels",
+        "begin: float\n    end: float",
+        "end: float\n    begin: float",
+        {"length"},
+    ),
+    "the name of a type": ("ahead_kernels", "class Span", "class Length", {"length"}),
     "a comment": ("ahead_kernels", "@pasted", "# said\n\n@pasted", set()),
 }
 
@@ -256,8 +272,9 @@ def test_a_kernel_whose_source_has_changed_is_left_to_numba(
     monkeypatch.syspath_prepend(tmp_path)
     for one in ("ahead_kernels", "ahead_limits"):
         sys.modules.pop(one, None)
+    _type_of.cache_clear()  # a program does not see its sources change
     edited = importlib.import_module("ahead_kernels")
-    names = ("total", "fill", "spin")
+    names = ("total", "fill", "spin", "length")
     assert {one for one in names if not library.is_valid_for(getattr(edited, one))} == changed
     assert {one for one in names if library.compiled(getattr(edited, one)) is None} == changed
 
@@ -308,11 +325,11 @@ def test_a_comparison_finds_one_bit(folder: Path) -> None:
         """
     )
     right, wrong = (run(folder, "-c", program, str(folder / "k.so"), kind, GND_KERNELS="numba") for kind in "ab")
-    compared = {"ahead_kernels:total": 2, "ahead_kernels:fill": 2, "ahead_kernels:spin": 1}
+    compared = {"ahead_kernels:total": 2, "ahead_kernels:fill": 2, "ahead_kernels:spin": 1, "ahead_kernels:length": 1}
     told = json.loads(right.stdout)
     assert (told["kernels"], told["unequal"], told["by_numba"]) == (compared, [], []), right.stderr
     assert set(told["times_us"]) == set(compared)
-    assert json.loads(wrong.stdout)["unequal"] == ["ahead_kernels:spin"], wrong.stderr
+    assert json.loads(wrong.stdout)["unequal"] == ["ahead_kernels:spin", "ahead_kernels:length"], wrong.stderr
 
 
 def test_a_kernel_stands_for_itself_in_every_way(library: KernelLibrary, kernels) -> None:

@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.ahead.fingerprint import fingerprint
-from gnd.ahead.library import VARIABLE, UnfitLibrary, environment, name_of, sealed
+from gnd.ahead.library import VARIABLE, UnfitLibrary, environment, name_of, sealed, type_name
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.jit import LazyKernel, record_calls
 
@@ -167,11 +167,10 @@ def _argument(given: Any) -> list[Any]:
         if given == plain:
             return [what, "", "", 0, 0, 0, "", []]
     if isinstance(given, types.Number):
-        return ["s", "", "", 0, 0, 0, f"numpy:{as_dtype(given).type.__name__}", []]
+        return ["s", "", "", 0, 0, 0, type_name(as_dtype(given).type), []]
     if isinstance(given, types.NamedTuple | types.NamedUniTuple):
-        cls = given.instance_class
         parts = [_argument(one) for one in given.types]
-        return ["N", "", "", 0, 0, 0, f"{cls.__module__}:{cls.__qualname__}", parts]
+        return ["N", "", "", 0, 0, 0, type_name(given.instance_class), parts]
     if isinstance(given, types.Tuple | types.UniTuple):
         return ["T", "", "", 0, 0, 0, "", [_argument(one) for one in given.types]]
     raise CannotBuild(f"an argument of type {given}")

@@ -11,7 +11,6 @@ import logging
 import os
 import platform
 import sysconfig
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -58,16 +57,26 @@ class KernelLibrary:
 
     def compiled(self, kernel: LazyKernel) -> Any | None:
         """What calls the machine code of a kernel; None where there is none of its present source."""
-        found = self.kernels.get(name_of(kernel))
-        if found is None or found["fingerprint"] != fingerprint(kernel.plain):
-            return None
-        overloads = tuple((one["number"], _specs(one["arguments"])) for one in found["entries"])
-        return self.module.make_kernel(kernel, kernel.otherwise, overloads)
+        overloads = self._overloads(kernel)
+        return None if overloads is None else self.module.make_kernel(kernel, kernel.otherwise, overloads)
 
     def is_valid_for(self, kernel: LazyKernel) -> bool:
         """Whether it has machine code of a kernel as its source is now."""
+        return self._overloads(kernel) is not None
+
+    def _overloads(self, kernel: LazyKernel) -> tuple[tuple[int, tuple[Any, ...]], ...] | None:
+        """By entry the types that it takes; None where source or types are others than when it was compiled."""
         found = self.kernels.get(name_of(kernel))
-        return found is not None and found["fingerprint"] == fingerprint(kernel.plain)
+        if found is None or found["fingerprint"] != fingerprint(kernel.plain):
+            return None
+        try:
+            return tuple((one["number"], _specs(one["arguments"])) for one in found["entries"])
+        except _OtherType:
+            return None
+
+
+class _OtherType(Exception):
+    """A class of arguments is no longer what it was."""
 
 
 def name_of(kernel: LazyKernel) -> str:
@@ -174,17 +183,20 @@ def _spec(
     return (what, kind or " ", layout or " ", writeable, itemsize, ndim, found, _specs(parts))
 
 
+def type_name(cls: type) -> str:
+    """How a library names a class of arguments: where it is, and the names of its fields in their order."""
+    return f"{cls.__module__}:{cls.__qualname__}:{','.join(getattr(cls, '_fields', ()))}"
+
+
 @cache
 def _type_of(name: str) -> type:
-    module, _, qualname = name.partition(":")
-    found: Any = import_module(module)
-    for part in qualname.split("."):
-        found = getattr(found, part)
-    assert isinstance(found, type)
+    module, qualname, _ = name.split(":")
+    try:
+        found: Any = import_module(module)
+        for part in qualname.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError):
+        raise _OtherType(name) from None
+    if not isinstance(found, type) or type_name(found) != name:
+        raise _OtherType(name)
     return found
-
-
-def valid_kernels(kernels: tuple[LazyKernel, ...]) -> Iterator[LazyKernel]:
-    """Those of `kernels` that the installed library holds as their source is now."""
-    library = installed_library()
-    return iter(()) if library is None else (one for one in kernels if library.is_valid_for(one))
