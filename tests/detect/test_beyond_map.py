@@ -1,6 +1,7 @@
 """What lies beyond the map extends it: it does not count towards what is implausible."""
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 from vehicle_scene import FIGURE_2
 
 from gnd.gnd_map.classes import ChangeClass
@@ -62,3 +63,17 @@ def test_a_tile_that_is_mostly_new_ground_is_no_implausible_change_and_a_tile_of
     walls = ids(*((x, 5, z) for x in range(12) for z in range(41, 71)))
     assert changed_share_of(classified(ROAD, walls)) > 0.7
     assert changed_share_of(classified(ids(), behind)) == 1.0, "without a map there is nothing that it could extend"
+
+
+def test_beside_is_scipys_dilation_up_to_the_edges_of_the_tile() -> None:
+    rng = np.random.default_rng(3)
+    known = rng.random((GRID.nx, GRID.ny)) < 0.03
+    known[0, 0] = known[-1, -1] = True
+    ground = ids(*((int(x), int(y), 40) for x, y in np.argwhere(known)))
+    new = ids(*((x, y, 43) for x in range(GRID.nx) for y in range(GRID.ny)))
+    found = classified(ground, new)
+    x, y, _ = GRID.unravel(found.evidence.voxel_id[beyond_map(found)])
+    beyond = np.zeros_like(known)
+    beyond[x, y] = True
+    np.testing.assert_array_equal(beyond, ~binary_dilation(known, np.ones((3, 3))))
+    assert 20 < beyond.sum() < known.size - 20

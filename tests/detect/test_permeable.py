@@ -2,10 +2,17 @@
 
 import numpy as np
 import pytest
+import scipy.special
 import scipy.stats
 
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.vehicle_agent.detect.permeable import OPACITY_OF_SURFACE, OPACITY_OF_VOLUME, is_gone, least_opacity
+from gnd.vehicle_agent.detect.permeable import (
+    OPACITY_OF_SURFACE,
+    OPACITY_OF_VOLUME,
+    is_gone,
+    least_opacity,
+    least_rays,
+)
 
 PLANE = (0.0004, 0.0, 0.0, 0.08, 0.0, 0.08)
 BUSH = (0.02, 0.0, 0.0, 0.03, 0.0, 0.07)
@@ -32,6 +39,16 @@ def test_the_number_of_hits_is_binomial() -> None:
         expected = scipy.stats.binom.cdf(hits, hits + passes, opacity) <= 0.02
         np.testing.assert_array_equal(is_gone(gaussians([cov] * 500), hits, passes), expected)
         assert 20 < expected.sum() < 480
+
+
+@pytest.mark.parametrize("share", [OPACITY_OF_SURFACE, OPACITY_OF_VOLUME])
+def test_the_table_of_few_hits_is_scipys_binomial_to_the_ray(share: float) -> None:
+    least, rays = least_rays(share, 400), np.arange(8000)
+    for hits in range(400):
+        n = np.maximum(rays, hits)
+        np.testing.assert_array_equal(n >= least[hits], scipy.special.bdtr(hits, n, share) <= 0.02)
+    far = least_rays(share, 20_000)[-1]  # what rounding adds up to on the way there
+    assert scipy.special.bdtr(19_999, far, share) <= 0.02 < scipy.special.bdtr(19_999, far - 1, share)
 
 
 def test_no_ray_deletes_nothing() -> None:

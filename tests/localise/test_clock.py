@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
-from gnd.vehicle_agent.localise.clock import MOST_S, PRIOR_S, ClockEstimator, _whitened
+from gnd.vehicle_agent.localise.clock import MOST_S, PRIOR_S, SHARED, ClockEstimator, _whitened, solve_chain
 from gnd.vehicle_agent.localise.odometry import ClockModel, MotionBuffer
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
@@ -217,3 +218,13 @@ def test_a_buffer_with_the_clock_known_gives_what_it_would_have_given_without_an
     assert late.unknown_s(3 * S, 4 * S) == 0.0
     assert late.age_s(right.last_ns + S) == pytest.approx(1.0, abs=1e-6)
     assert MOST_S < 1.0  # the estimator never sets such a clock; the buffer does not care
+
+
+def test_a_chain_of_steps_is_solved_as_scipys_banded_cholesky_does():
+    rng = np.random.default_rng(4)
+    for n in (1, 2, 300):
+        beside, columns = np.where(rng.random(n - 1) < 0.9, SHARED, 0.0), rng.normal(size=(n, 6))
+        band = np.stack([np.append(0.0, beside), np.ones(n)])
+        expected = cho_solve_banded((cholesky_banded(band), False), columns)
+        solve_chain(beside, np.ones(n), columns)
+        np.testing.assert_allclose(columns, expected, rtol=0.0, atol=1e-14)

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
@@ -201,9 +200,10 @@ def beyond_map(found: Classification) -> NDArray[np.bool_]:
     """
     base = found.evidence.base
     grid = VoxelGrid.of(base.tile_id)
-    known = np.zeros((grid.nx, grid.ny), np.bool_)
+    near = np.zeros((grid.nx + 2, grid.ny + 2), np.bool_)
     x, y, _ = grid.unravel(base.gaussians.voxel_id)
-    known[x, y] = True
-    beside = binary_dilation(known, np.ones((3, 3), np.bool_))
+    for dx in range(3):
+        for dy in range(3):
+            near[x + dx, y + dy] = True
     x, y, _ = grid.unravel(found.evidence.voxel_id)
-    return np.asarray((found.change_class == ChangeClass.NEW) & ~beside[x, y])
+    return np.asarray((found.change_class == ChangeClass.NEW) & ~near[x + 1, y + 1])

@@ -10,13 +10,15 @@ and in front of the wall that one Gaussian holds together, hundreds of times wit
 of a Gaussian that is no plane; a plane that they cross they would meet.
 """
 
+from array import array
+from functools import cache
+from threading import Lock
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtr
 
-from gnd.gnd_map.arrays import F64, I32
+from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.vehicle_agent.detect.records import planar_normals
 
@@ -47,5 +49,47 @@ def is_gone(gaussians: Gaussians, hits: I32, passes: I32, *, at_one_height: bool
         at_one_height: all rays came from a sensor of a few level layers.
     """
     opacity = least_opacity(gaussians)
-    gone = bdtr(hits, hits + passes, opacity) <= _CHANCE
+    rays = hits.astype(np.int64) + passes
+    gone = np.zeros(len(hits), np.bool_)
+    for share in (OPACITY_OF_SURFACE, OPACITY_OF_VOLUME):
+        rows = np.flatnonzero((opacity == share) & (hits < share * rays))  # of more hits every second happens by chance
+        least = least_rays(share, int(hits[rows].max(initial=0)) + 1)
+        gone[rows] = rays[rows] >= least[hits[rows]]
     return np.asarray(gone & (opacity == OPACITY_OF_SURFACE) if at_one_height else gone)
+
+
+def least_rays(share: float, n: int) -> I64:
+    """(n,) of how many rays 0, 1 … n - 1 hits are so few that they show that what stops `share` of them is gone."""
+    return _few_hits(share).least(n)
+
+
+class _FewHits:
+    """From how many rays on P(at most k hits) <= _CHANCE, by k: walked along that edge, where P never underflows."""
+
+    def __init__(self, share: float) -> None:
+        self._share, self._least, self._growing = share, array("q"), Lock()
+        self._rays, self._exactly, self._most = 0, 1.0, 1.0  # P(k hits), P(at most k hits)
+
+    def least(self, n: int) -> I64:
+        """(n,) the first of them."""
+        with self._growing:
+            self._grow(n)
+            return np.array(self._least[:n], np.int64)
+
+    def _grow(self, n: int) -> None:
+        p, q, rays, exactly, most = self._share, 1.0 - self._share, self._rays, self._exactly, self._most
+        for hits in range(len(self._least), n):
+            if hits:
+                exactly *= (rays - hits + 1) * p / (hits * q)
+                most += exactly
+            while most > _CHANCE:
+                most -= exactly * p
+                exactly *= (rays + 1) * q / (rays + 1 - hits)
+                rays += 1
+            self._least.append(rays)
+        self._rays, self._exactly, self._most = rays, exactly, most
+
+
+@cache
+def _few_hits(share: float) -> _FewHits:
+    return _FewHits(share)

@@ -11,6 +11,8 @@ from gnd.vehicle_agent.features.errors import FeatureLayerError
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.view import SensorView
 
+LANES: Final = "lanes"
+"""The layer that vehicles without LiDAR localise by."""
 MARGIN_M: Final = 10.0
 """A tile this much farther away than a sensor sees is left: it is decided."""
 _LIDAR_KINDS: Final = ("pole", "trunk", "traffic_sign", "streetlight")

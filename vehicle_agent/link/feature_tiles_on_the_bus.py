@@ -9,7 +9,7 @@ from typing import Final
 from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.config import AgentConfig
-from gnd.vehicle_agent.features.mapping.held_map import LANES
+from gnd.vehicle_agent.features.layer_parameters import LANES
 from gnd.vehicle_agent.link.feature_download import FeatureDownloader
 from gnd.vehicle_agent.link.link import Link
 from gnd.vehicle_agent.place import Place

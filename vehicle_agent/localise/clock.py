@@ -15,9 +15,9 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.jit import bare
 from gnd.vehicle_agent.localise.odometry import ClockModel, MotionBuffer
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
@@ -346,11 +346,36 @@ def _whitened(J: F64, rest: F64, noise: F64, used: NDArray[np.bool_], joined: ND
     if not len(at):
         return np.zeros((5, 5)), np.zeros(5)
     A, r = J[at] / noise[at, None], rest[at] / noise[at]
-    band = np.zeros((2, len(at)))
-    band[1] = 1.0
-    band[0, 1:] = np.where((np.diff(at) == 1) & joined[at[:-1]], SHARED, 0.0)
-    whitened = cho_solve_banded((cholesky_banded(band), False), np.column_stack([A, r]))
+    shared = np.where((np.diff(at) == 1) & joined[at[:-1]], SHARED, 0.0)
+    whitened = np.column_stack([A, r])
+    solve_chain(shared, np.ones(len(at)), whitened)
     return A.T @ whitened[:, :5], A.T @ whitened[:, 5]
+
+
+@bare
+def solve_chain(beside: F64, diagonal: F64, columns: F64) -> None:
+    """Put C⁻¹ x in the place of the columns x (N, M), C tri-diagonal and positive definite, by Cholesky (LAPACK's pbtrf
+    and pbtrs with one band).
+
+    Args:
+        beside: (N - 1,) what stands beside C's diagonal.
+        diagonal: (N,) its diagonal; the factor's afterwards.
+        columns: (N, M), C-contiguous.
+    """
+    n, m = columns.shape
+    for i in range(n):
+        if i > 0:
+            diagonal[i] -= (beside[i - 1] / diagonal[i - 1]) ** 2
+        diagonal[i] = np.sqrt(diagonal[i])
+        for k in range(m):
+            if i > 0:
+                columns[i, k] -= beside[i - 1] / diagonal[i - 1] * columns[i - 1, k]
+            columns[i, k] /= diagonal[i]
+    for i in range(n - 1, -1, -1):
+        for k in range(m):
+            if i < n - 1:
+                columns[i, k] -= beside[i] / diagonal[i] * columns[i + 1, k]
+            columns[i, k] /= diagonal[i]
 
 
 def _integral(t: F64, y: F64, at: F64) -> F64:

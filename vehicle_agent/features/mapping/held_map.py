@@ -11,10 +11,10 @@ from gnd.gnd_map.features import CUT_START, Feature, FeatureTile
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.features.feature_map import features_in_map
+from gnd.vehicle_agent.features.layer_parameters import LANES
 from gnd.vehicle_agent.features.look import MapFeatures
 from gnd.vehicle_agent.features.mapping.lane_map import LaneMap
 
-LANES: Final = "lanes"
 LEAST_LANE_M: Final = 5.0
 """Shorter pieces of a lane give no direction."""
 
