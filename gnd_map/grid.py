@@ -53,9 +53,10 @@ def divisions(lat_index: npt.ArrayLike) -> tuple[I64, I64]:
 
 
 @lru_cache(maxsize=1)
-def _divisions_table() -> tuple[I64, I64]:
-    """(nx, ny) of every latitude index; one table, so that no two callers round differently."""
-    return divisions(np.arange(LAT_TILES))
+def _divisions_table() -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """(nx, ny) of every latitude index, at most 39; one table, so that no two callers round differently."""
+    nx, ny = divisions(np.arange(LAT_TILES))
+    return nx.astype(np.uint8), ny.astype(np.uint8)
 
 
 @dataclass(frozen=True, slots=True)

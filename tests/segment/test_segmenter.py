@@ -136,7 +136,7 @@ def test_an_empty_scan_and_a_pause_pass_through() -> None:
     assert [len(s.moving) for s in found] == [len(s.points_map_m) for s in order]
 
 
-def test_what_waits_takes_less_than_half_of_the_memory() -> None:
+def test_what_waits_takes_less_than_two_fifths_of_the_memory() -> None:
     segmenter = MotionSegmenter()
     labelled = list(scans(SENSORS["16 layers"], (ONCOMING,), seconds=1.2))
     for scan, _ in labelled:
@@ -144,10 +144,10 @@ def test_what_waits_takes_less_than_half_of_the_memory() -> None:
     held = sum(
         array.nbytes
         for h in segmenter._held
-        for array in (h.rays.points_m, h.rays.starts, h.objects.voxel_of)  # type: ignore[union-attr]
+        for array in (h.rays.points_m, h.rays.starts, h.rays.until, h.objects.voxel_of)  # type: ignore[union-attr]
     )
     came = sum(scan.points_map_m.nbytes + scan.origins_map_m.nbytes for scan, _ in labelled)
-    assert held < 0.5 * came
+    assert held < 0.4 * came
 
 
 @pytest.mark.parametrize("bad", [{"future_s": -1.0}, {"future_s": 101.0}, {"range_max_m": 1.0}, {"range_max_m": 301.0}])

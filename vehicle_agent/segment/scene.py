@@ -13,6 +13,7 @@ from gnd.vehicle_agent.segment.image_kernels import Optics, RangeJudge, draw_ima
 from gnd.vehicle_agent.segment.parameters import RANGE_MIN_M, SegmentParameters
 from gnd.vehicle_agent.segment.voxel_kernels import find_objects
 
+I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
 
 WEIGHTS: Final = 4
@@ -93,7 +94,7 @@ class Objects:
 
     points: (V, 3) float32 one measured point of each, relative to the scan's centre. index: (V, 3) int32. passed, met:
     (V,) uint8 votes so far. reach: (V,) uint8, voxels from one layer to the next there. voxel_of:
-    (N,) int32, the voxel of each point of the scan, or what else it is.
+    (N,) int32, the voxel of each point of the scan, or what else it is; int16 while it waits, where that is enough.
     """
 
     points: F32
@@ -101,7 +102,7 @@ class Objects:
     passed: U8
     met: U8
     reach: U8
-    voxel_of: I32
+    voxel_of: I32 | I16
 
 
 def hash_table(n: int) -> tuple[I64, I32]:

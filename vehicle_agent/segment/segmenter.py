@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -44,6 +44,7 @@ I16 = NDArray[np.int16]
 Mask = NDArray[np.bool_]
 
 _S = 1_000_000_000
+_MOST_OF_I16: Final = 32767
 OLD_STEP = 3
 
 
@@ -103,11 +104,14 @@ class MotionSegmenter:
             self._hear_the_past(scan.t_ns, objects, centre)
             if not self._images or scan.t_ns - self._images[-1].t_ns >= _EVERY_S * _S - _S // 50:
                 R = scan.estimate.T_map_vehicle[:3, :3].T.copy()
-                image = image_of(scan.t_ns, centre, R, points, origins, objects.voxel_of)
+                voxel_of = objects.voxel_of.astype(np.int32, copy=False)
+                image = image_of(scan.t_ns, centre, R, points, origins, voxel_of)
                 self._tell_the_held(image)
                 self._images.append(image)
                 self._gap_tan, self._tan_low = image.gap_tan, image.optics.tan_low
                 self._judge = judge_of(self._gap_tan)
+            if len(objects.points) <= _MOST_OF_I16:
+                objects = replace(objects, voxel_of=objects.voxel_of.astype(np.int16))
         self._held.append(_LaggedScan(scan.t_ns, scan.estimate, rays, objects))
 
     def _hear_the_past(self, t_ns: int, objects: Objects, centre_m: F64) -> None:
@@ -145,7 +149,8 @@ class MotionSegmenter:
         if not moves.any():
             return np.zeros(len(held.rays.points_m), np.bool_)
         table = hash_table(int(moves.sum()))
-        return moving_points(held.rays.points_m, objects.voxel_of, objects.index, moves, SEGMENT_VOXEL_M, *table)
+        voxel_of = objects.voxel_of.astype(np.int32, copy=False)
+        return moving_points(held.rays.points_m, voxel_of, objects.index, moves, SEGMENT_VOXEL_M, *table)
 
 
 def decide(objects: Objects) -> Mask:
