@@ -57,11 +57,11 @@ def give_back_code() -> int:
     """Give back to the system the pages of libraries that nobody has written to: what runs again is mapped again from
     the page cache, 16 pages at a time. Bytes whose pages were given back, used or not; 0 where there is no /proc.
     """
-    library = _glibc()
-    pages = _unwritten(Path("/proc/self/smaps")) if library is not None else []
-    done = 0
-    for first, end in pages:
-        if library is not None and library.madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), _MADV_DONTNEED) == 0:
+    library, done = _glibc(), 0
+    if library is None:
+        return 0
+    for first, end in _unwritten(Path("/proc/self/smaps")):
+        if library.madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), _MADV_DONTNEED) == 0:
             done += end - first
     return done
 

@@ -135,6 +135,31 @@ def test_an_agent_killed_on_the_way_is_started_again_and_loses_nothing(cloud_of:
 
 
 @pytest.mark.slow
+def test_a_vehicle_with_lidar_asks_for_no_scipy(cloud_of: Cloud, config: AgentConfig) -> None:
+    """Whoever asks for it is told; numba does where it compiles, and that is not ours."""
+    program = """
+import sys
+asked = set()
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("scipy", "small_gicp"):
+            frame = sys._getframe(1)
+            while "importlib" in frame.f_code.co_filename:
+                frame = frame.f_back
+            asked.add(frame.f_globals["__name__"].split(".")[0])
+sys.meta_path.insert(0, Watch())
+from gnd.vehicle_agent.cli import agent
+agent(standalone_mode=False)
+print("asked by", sorted(asked - {"scipy", "numba"}), "numba" in sys.modules or "scipy" not in sys.modules)
+"""
+    arguments = ["--vehicle", "probe", "--drive", str(config.drive), "--work-dir", str(config.work_dir)]
+    command = [sys.executable, "-c", program, *arguments, "--connect", config.connect[0]]
+    told = subprocess.run(command, capture_output=True, text=True, check=True, timeout=400).stdout
+    assert told.splitlines()[-1] == "asked by [] True"
+    assert json.loads((config.work_dir / "result.json").read_text())["scans_used"] > 45
+
+
+@pytest.mark.slow
 def test_bad_scans_are_counted_and_the_drive_goes_on(cloud_of: Cloud, config: AgentConfig, tmp_path: Path) -> None:
     path, constant, empty = tmp_path / "bad.mcap", 0, 0
     with DriveWriter(path, read_header(config.drive)) as writer:
