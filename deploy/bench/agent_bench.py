@@ -47,6 +47,7 @@ class AgentFigures:
             included.
         ms: CPU of the agent's thread a scan [ms] by stage: mean, p50, p99; "whole scan" is their sum.
         memory_mb: resident memory when the first item is asked for, and the most.
+        holders_mb: resident memory by holder after the last scan.
         start_s: CPU of each step until the first scan is worked on.
         compiling_s: CPU of compiling kernels, 0 where the disk holds them: in all, and after the first scan.
         end_s: CPU of the end of the drive: what waits in the lags is judged and reported.
@@ -57,6 +58,7 @@ class AgentFigures:
     real_time: float
     ms: dict[str, dict[str, float]]
     memory_mb: dict[str, float]
+    holders_mb: dict[str, float]
     start_s: dict[str, float]
     compiling_s: tuple[float, float]
     end_s: float
@@ -74,6 +76,7 @@ class AgentFigures:
             told["drive_s"] / told["cpu_s"],
             {stage: _spread(ms) for stage, ms in by_stage.items()},
             told["memory_mb"],
+            told["holders_mb"],
             told["start_s"],
             (told["compiling_s"]["all"], told["compiling_s"]["later"]),
             sum(told["end"].values()),

@@ -94,6 +94,10 @@ def _show(found: dict[str, Any]) -> None:
     table.add_row("times real time, one core", *(f"{one['real_time']:.2f}" for one in drives.values()), style="bold")
     table.add_row("memory, MB: start", *(f"{one['memory_mb']['start']:.0f}" for one in drives.values()))
     table.add_row("memory, MB: peak", *(f"{one['memory_mb']['peak']:.0f}" for one in drives.values()))
+    for holder in dict.fromkeys(holder for one in drives.values() for holder in one["holders_mb"]):
+        table.add_row(
+            f"memory, MB: {holder}", *(f"{one['holders_mb'].get(holder, 0.0):.0f}" for one in drives.values())
+        )
     for step in next(iter(drives.values()))["start_s"]:
         table.add_row(f"start, s: {step}", *(f"{one['start_s'][step]:.2f}" for one in drives.values()))
     console.print(table)

@@ -95,6 +95,7 @@ def measured(asked: dict[str, Any]) -> dict[str, Any]:
 def _driven(
     vehicle: "AgentVehicle", stopwatch: "Stopwatch", start: dict[str, float], compiled: list[float]
 ) -> dict[str, Any]:
+    from gnd.deploy.bench.holders import holders_now_mb
     from gnd.schemas.drive import Scan
     from gnd.vehicle_agent.memory import resident_mb
 
@@ -108,6 +109,7 @@ def _driven(
                 start["first scan"], at_once_s = time.process_time(), sum(compiled)
             stopwatch.lap()
             peak_mb = max(peak_mb, resident_mb())
+    holders = holders_now_mb()
     vehicle.finish()
     stopwatch.lap()
     peak_mb = max(peak_mb, resident_mb())
@@ -122,6 +124,7 @@ def _driven(
         "end": end,
         "compiling_s": {"all": sum(compiled), "later": sum(compiled) - at_once_s},
         "memory_mb": {"start": at_start_mb, "peak": peak_mb},
+        "holders_mb": holders,
     }
 
 
