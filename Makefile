@@ -3,6 +3,8 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+PYTHONS ?= $(PYTHON)
+TOOLS := build/tools
 # Tests run in three processes, also on two cores: those of the bus and of attacks wait for much of their time.
 # Whole fleets run one after the other in one of them: they need the cores.
 TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 3 || echo 0)
@@ -10,7 +12,7 @@ SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs extras bench studies schemas page kernels wheel lock sbom audit clean
+.PHONY: help setup fleet test quick check docs extras bench studies schemas page kernels wheel dist installed wheels image lock sbom audit clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -56,6 +58,20 @@ extras:          ## install each extra alone into an environment of its own, and
 	cd build/extras && serve/bin/gnd serve --help > serve.txt
 	cd build/extras && client/bin/gnd map info map.sqlite && client/bin/python -c "import gnd; print(len(gnd.Map('map.sqlite').gaussians()))"
 
+dist: $(TOOLS)/.ready  ## build wheel and source archive into dist/, twice: the same bytes; checked, also against CHANGELOG.md
+	rm -rf dist
+	$(TOOLS)/bin/cffconvert --validate -i CITATION.cff
+	$(TOOLS)/bin/python -m tools.dist --twice
+
+installed:       ## install what lies in dist/ into fresh environments and run a small fleet: make installed PYTHONS="python3.11 python3.13"
+	$(TOOLS)/bin/python -m tools.installed $(foreach one,$(PYTHONS),--python $(one))
+
+wheels: $(TOOLS)/.ready  ## ask the index which libraries have wheels for which Python and machine (needs a network)
+	$(TOOLS)/bin/python -m tools.wheels $(ARGS)
+
+image: $(TOOLS)/.ready  ## build the container image, with the version of this checkout
+	docker build -f deploy/Dockerfile --build-arg VERSION=$$($(TOOLS)/bin/python -m tools.dist --version) -t gnd-fleet .
+
 bench: setup     ## measure speed beside others who do the same work, on this machine: docs/benchmarks.md
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[peers]'
 	$(BIN)/python -m studies.speed --out docs/benchmarks.md $(ARGS)
@@ -79,14 +95,13 @@ kernels: setup   ## compile all kernels ahead of time, into this checkout: progr
 wheel: kernels   ## a wheel with these kernels, for this version of Python and this kind of machine: build/wheel
 	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
 
-TOOLS := build/tools
-$(TOOLS)/.ready:
+$(TOOLS)/.ready: Makefile
 	$(PYTHON) -m venv $(TOOLS)
-	$(TOOLS)/bin/pip install --quiet --disable-pip-version-check pip-tools cyclonedx-bom pip-audit
+	$(TOOLS)/bin/pip install --quiet --disable-pip-version-check build cffconvert cyclonedx-bom pip-audit pip-tools setuptools-scm twine
 	@touch $@
 
 LOCK = $(TOOLS)/bin/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
-  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --extra vehicle --extra cloud --extra sim --extra postgres --extra objects --build-deps-for wheel -c constraints.txt
+  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --extra vehicle --extra cloud --extra sim --extra postgres --extra objects --extra lanes --build-deps-for wheel -c constraints.txt
 
 lock: $(TOOLS)/.ready  ## pin what the image installs, by version and hash: deploy/requirements.lock
 	$(LOCK) -o deploy/requirements.lock pyproject.toml

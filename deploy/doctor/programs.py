@@ -12,7 +12,7 @@ from typing import Any, Final
 import gnd
 from gnd.ahead.library import KernelLibrary, UnfitLibrary, library_path, load
 from gnd.deploy.doctor.finding import Finding
-from gnd.extras import LEFT_OUT
+from gnd.extras import OF_A_FLEET, OF_THE_PAGE
 from gnd.gnd_map import jit
 from gnd.gnd_map.jit import LazyKernel
 
@@ -56,7 +56,7 @@ def packages() -> Iterator[Finding]:
 
 def extras() -> Finding:
     """Whether the libraries of vehicles, shards and the simulator are there."""
-    missing = sorted(name for name in LEFT_OUT if find_spec(name) is None)
+    missing = sorted(name for name in OF_A_FLEET | OF_THE_PAGE if find_spec(name) is None)
     if not missing:
         return Finding("extras", "ok", "vehicle, cloud and simulator can run here")
     says = f"not installed: {', '.join(missing)}"

@@ -12,6 +12,10 @@ OF_THE_PAGE: Final = frozenset(("starlette", "uvicorn", "websockets"))
 """Modules of `gnd serve`; a fleet goes without them, and says so."""
 LEFT_OUT: Final = OF_THE_PAGE | {"gtsam", "matplotlib", "mpl_toolkits", "psutil", "scipy", "sklearn", "small_gicp"}
 """Modules of other projects that only extras bring; pyproject.toml has the same table by extra."""
+_EXTRA_OF_MODULE: Final = {**dict.fromkeys(OF_THE_PAGE, "serve"), "small_gicp": "lanes"}
+"""What one extra alone brings; small_gicp has no wheel for every machine that all others have one for."""
+OF_A_FLEET: Final = LEFT_OUT - _EXTRA_OF_MODULE.keys()
+"""What a whole fleet cannot run without."""
 EXTRA_OF: Final = {
     "gnd.vehicle_agent": "vehicle",
     "gnd.cloud_merger": "cloud",
@@ -30,20 +34,19 @@ def missing_extra(error: ModuleNotFoundError) -> MissingExtra | None:
     module = (error.name or "").split(".")[0]
     if module not in LEFT_OUT:
         return None
-    if module in OF_THE_PAGE:
-        return MissingExtra(f"{module} is not installed; it comes with: pip install 'gnd-fleet[serve]'")
     packages = [".".join(name.split(".")[:2]) for name in _modules(error.__traceback__)]
     extra = next((EXTRA_OF[package] for package in reversed(packages) if package in EXTRA_OF), "all")
+    extra = _EXTRA_OF_MODULE.get(module, extra)
     return MissingExtra(f"{module} is not installed; it comes with: pip install 'gnd-fleet[{extra}]'")
 
 
 def need_all() -> None:
-    """For commands that run every part of the system but the page: refuse to begin where one is not installed.
+    """For commands that run every part of a fleet: refuse to begin where one is not installed.
 
     Raises:
         MissingExtra: with the modules that are missing.
     """
-    missing = sorted(name for name in LEFT_OUT - OF_THE_PAGE if not _is_there(name))
+    missing = sorted(name for name in OF_A_FLEET if not _is_there(name))
     if missing:
         raise MissingExtra(f"{', '.join(missing)}: not installed; this command needs: pip install 'gnd-fleet[all]'")
 

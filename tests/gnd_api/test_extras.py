@@ -14,7 +14,7 @@ from gnd.fleet_sim.street import StreetOptions, street
 from gnd.fleet_sim.world import write_world
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = {name: PROJECT["optional-dependencies"][name] for name in ("vehicle", "cloud", "sim", "serve")}
+EXTRAS = {name: PROJECT["optional-dependencies"][name] for name in ("vehicle", "cloud", "sim", "serve", "lanes")}
 
 
 def name_of(requirement: str) -> str:
@@ -153,7 +153,7 @@ def test_a_fleet_without_all_extras_names_them_before_anything_is_written(
     )
     assert program.end() == 2, program.lines
     (line,) = program.lines
-    missing = ", ".join(sorted(extras.LEFT_OUT - extras.OF_THE_PAGE))
+    missing = ", ".join(sorted(extras.OF_A_FLEET))
     assert line == f"gnd: {missing}: not installed; this command needs: pip install 'gnd-fleet[all]'"
     assert not (tmp_path / "f").exists()
 
@@ -181,6 +181,6 @@ def test_the_table_of_what_is_left_out_is_that_of_pyproject() -> None:
     brought = {name_of(one) for requirements in EXTRAS.values() for one in requirements} - base
     module_of = {"scikit-learn": "sklearn", "small-gicp": "small_gicp"}
     assert {module_of.get(name, name) for name in brought} == extras.LEFT_OUT - {"mpl_toolkits"}
-    assert {*extras.EXTRA_OF.values(), "serve"} == set(EXTRAS)
+    assert {*extras.EXTRA_OF.values(), "serve", "lanes"} == set(EXTRAS)
     assert PROJECT["optional-dependencies"]["all"] == ["gnd-fleet[vehicle,cloud,sim,serve]"]
     assert not base & {"gtsam", "scipy", "scikit-learn", "small-gicp", "matplotlib", "pyproj"}

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from gnd.extras import explained
 from gnd.gnd_map.arrays import F64, I64, check_array
 from gnd.vehicle_agent.errors import NewLayerError
 
@@ -142,7 +142,12 @@ def gicp(target_xy_m: F64, source_xy_m: F64, pose: F64, max_correspondence_m: fl
 
     Returns:
         (3,) the pose. Along straight lanes it stays with the first guess.
+
+    Raises:
+        MissingExtra: `gnd-fleet[lanes]` is not installed.
     """
+    with explained():
+        import small_gicp
     origin = pose[:2]
     c, s = np.cos(pose[2]), np.sin(pose[2])
     T = np.eye(4)
