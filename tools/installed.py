@@ -1,7 +1,7 @@
 """Install the packages of dist/ into fresh environments, and run real work there, far from the checkout.
 
-For each Python: the wheel with `[all]`, and a small job from end to end: a street is simulated, mapped and driven, a
-fleet of one vehicle updates the map over real sessions, and its run is reported and served as a page. Then the source
+For each Python: the wheel with `[all]`, and a small job from end to end: a street is simulated and mapped, boxes are
+put into it, a fleet of two vehicles finds them over real sessions, and its run is reported and served as a page. Then the source
 archive is built and installed into an environment of its own, which must come to hold the same files.
 """
 
@@ -89,11 +89,10 @@ def small_job(environment: Environment) -> dict[str, object]:
     gnd = environment.run
     gnd("gnd", "sim", "world", "write", "street.json", "--seed", "11", "--length", "100")
     gnd("gnd", "sim", "drive", "street.json", "before.mcap", "--state", "before", "--cars", "0", "--scans", "90")
-    gnd("gnd", "sim", "drive", "street.json", "after.mcap", "--scans", "70", "--seed", "3")
     gnd("gnd", "map", "build", "-o", "map.sqlite", "before.mcap")
     gnd("gnd", "map", "verify", "map.sqlite")
     gnd(
-        "gnd", "fleet", "--drives", "after.mcap", "--map", "map.sqlite", "--agents", "1", "--shards", "1",
+        "gnd", "fleet", "--drives", "before.mcap", "--made-up", "4", "--map", "map.sqlite", "--agents", "2", "--shards", "1",
         "--out", "run", "--link", "none", "--no-page",
     )  # fmt: skip
     gnd("gnd", "report", "run")

@@ -74,7 +74,9 @@ def test_the_lock_is_that_of_the_pinned_versions() -> None:
     assert set(lock) - set(constraints) <= {"setuptools"}, "a package of the image is not pinned"
     text = (DEPLOY.parent / "pyproject.toml").read_text()
     wanted = tomllib.loads(text)["project"]
-    extras = [wanted["optional-dependencies"][name] for name in ("vehicle", "cloud", "sim", "postgres", "objects", "lanes")]
+    extras = [
+        wanted["optional-dependencies"][name] for name in ("vehicle", "cloud", "sim", "postgres", "objects", "lanes")
+    ]
     for requirement in sum(extras, wanted["dependencies"]):
         name = re.match(r"[A-Za-z0-9._-]+", requirement)
         assert name is not None

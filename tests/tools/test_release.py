@@ -105,7 +105,7 @@ def test_a_release_without_its_section_is_refused_until_it_is_made(tmp_path: Pat
     with pytest.raises(ReleaseError, match="no version of a release"):
         release("7.2", dt.date(2026, 12, 25), folder)
     citation.write_text(citation.read_text().replace("7.1.0", "7.0.9"))
-    with pytest.raises(ReleaseError, match="CITATION.cff does not name version"):
+    with pytest.raises(ReleaseError, match=r"CITATION\.cff does not name version"):
         check_ready("7.1.0", folder)
 
 
@@ -146,8 +146,9 @@ def test_an_archive_packed_anew_tells_nothing_of_the_machine(tmp_path: Path) -> 
 def test_a_wheel_must_hold_what_git_knows_and_nothing_else(tmp_path: Path) -> None:
     wanted = {name: path for name, path in _files_of_packages(ROOT).items() if not _stays(path, ROOT)}
     needed = {
-        "gnd/deploy/serve/page/page.js", "gnd/deploy/fleet.toml", "gnd/deploy/links.toml", "gnd/deploy/chaos/street.bin",
-        "gnd/deploy/status/alert_rules.template.yaml", "gnd/tile_store/sql/sqlite.sql", "gnd/gnd_map/codec/priors.bin",
+        "gnd/deploy/serve/page/page.js", "gnd/deploy/fleet.toml", "gnd/deploy/links.toml",
+        "gnd/deploy/chaos/street.bin", "gnd/deploy/status/alert_rules.template.yaml", "gnd/tile_store/sql/sqlite.sql",
+        "gnd/gnd_map/codec/priors.bin",
         "gnd/vehicle_agent/detect/shape_change.json", "gnd/schemas/tile_blob.proto", "gnd/py.typed", "gnd/__init__.py",
     }  # fmt: skip
     assert needed <= wanted.keys()
@@ -162,9 +163,9 @@ def test_a_wheel_must_hold_what_git_knows_and_nothing_else(tmp_path: Path) -> No
 
     files = {name: path.read_bytes() for name, path in wanted.items()}
     assert check_contents(wheel(files | {"gnd_fleet-1.dist-info/RECORD": b""})) == len(files) > 900
-    with pytest.raises(ReleaseError, match="1 files not in the wheel: gnd/deploy/serve/page/page.js"):
+    with pytest.raises(ReleaseError, match=r"1 files not in the wheel: gnd/deploy/serve/page/page\.js"):
         check_contents(wheel({name: body for name, body in files.items() if not name.endswith("page.js")}))
-    with pytest.raises(ReleaseError, match="1 files not known to git: gnd/secret.key"):
+    with pytest.raises(ReleaseError, match=r"1 files not known to git: gnd/secret\.key"):
         check_contents(wheel(files | {"gnd/secret.key": b"x"}))
-    with pytest.raises(ReleaseError, match="1 files not as in git: gnd/deploy/fleet.toml"):
+    with pytest.raises(ReleaseError, match=r"1 files not as in git: gnd/deploy/fleet\.toml"):
         check_contents(wheel(files | {"gnd/deploy/fleet.toml": b"x"}))

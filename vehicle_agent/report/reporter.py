@@ -76,7 +76,8 @@ class Identity:
     drive_id: str
     sensor_model: str
     layer: str
-    software: str = field(default_factory=lambda: f"gnd-fleet {version('gnd-fleet')}")
+    software: str = field(default_factory=lambda: f"gnd-fleet {version('gnd-fleet').partition('+')[0]}")
+    """Without the commit between releases: it would cost ten bytes a report."""
     is_private: bool = False
     """The begin of the trip is told to the hour before."""
 
