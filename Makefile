@@ -12,7 +12,7 @@ SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs extras bench studies schemas page kernels wheel dist installed wheels image lock sbom audit clean
+.PHONY: help setup fleet test quick check docs extras bench studies schemas page kernels wheel dist installed wheels pictures image lock sbom audit clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -57,6 +57,9 @@ extras:          ## install each extra alone into an environment of its own, and
 	cd build/extras && cloud/bin/gnd merger --help > merger.txt && cloud/bin/gnd map verify map.sqlite
 	cd build/extras && serve/bin/gnd serve --help > serve.txt
 	cd build/extras && client/bin/gnd map info map.sqlite && client/bin/python -c "import gnd; print(len(gnd.Map('map.sqlite').gaussians()))"
+
+pictures: setup  ## draw the pictures of the documents anew, but for those of long studies: make pictures ARGS="world healing"
+	$(BIN)/python -m tools.pictures $(ARGS)
 
 dist: $(TOOLS)/.ready  ## build wheel and source archive into dist/, twice: the same bytes; checked, also against CHANGELOG.md
 	rm -rf dist

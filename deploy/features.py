@@ -14,6 +14,7 @@ from gnd.gnd_map.features import Feature, FeatureTile, feature_id_of
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.features import FeatureReport
 from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
+from gnd.words import many
 
 
 def put_base_layers(store: Path, features: Path, layers: Sequence[str]) -> None:
@@ -122,7 +123,7 @@ def _line(layer: str, told: dict[str, Any]) -> str:
     stages = ", ".join(f"{_text(told[stage].get('all'))} % {word}" for stage, word in _STAGES if told.get(stage))
     after = told["after"]
     error = "" if after["new_error_m"] is None else f", new ones {after['new_error_m'] * 100:.1f} cm off"
-    return f"layer {layer}: {told['features']} features; of all changes and what stayed, right: {stages}{error}"
+    return f"layer {layer}: {many(told['features'], 'feature')}; of all changes and what stayed, right: {stages}{error}"
 
 
 _STAGES = (("before", "before"), ("single", "by a single drive"), ("after", "after"))

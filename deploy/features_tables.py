@@ -11,13 +11,14 @@ from gnd.tile_store.feature_io.formats import FeaturesExported
 from gnd.tile_store.feature_io.stored import ImportResult, layer_tiles
 from gnd.tile_store.feature_io.values import MapFeature
 from gnd.tile_store.sqlite_store import SqlStore
+from gnd.words import many
 
 
 def print_import(console: Console, path: str, result: ImportResult) -> None:
     """What an import did."""
     told = {
         "from": f"{result.source} ({result.format})",
-        **{f"layer {layer}": f"{n} features" for layer, n in result.features.items()},
+        **{f"layer {layer}": many(n, "feature") for layer, n in result.features.items()},
         **_lanes(result.lanes),
         "left out": _counted(result.left_out) or "nothing",
         **({"kept in the file": _counted(result.kept)} if result.kept else {}),

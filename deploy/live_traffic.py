@@ -16,7 +16,7 @@ from rich.table import Table
 from gnd.fleet_bus.errors import LedgerError
 from gnd.fleet_bus.ledger_file import AgentLedger, read_run
 from gnd.fleet_bus.links import UNLIMITED, LinkProfile
-from gnd.fleet_bus.traffic import AgentTraffic, agent_traffic, fleet_lines, fleet_totals, per_km
+from gnd.fleet_bus.traffic import AgentTraffic, agent_traffic, fleet_lines, fleet_totals, kind_text, per_km
 from gnd.fleet_bus.traffic_wire import RESIDUES
 
 _OLD_S: Final = 15.0
@@ -123,7 +123,9 @@ def kinds_table(agents: Sequence[AgentTraffic]) -> Table:
     for column in ("down kB", "kB/km", "up kB", "kB/km"):
         table.add_column(column, justify="right")
     for kind, sizes in rows.items():
-        table.add_row(kind, *_cells(sizes["down"], total["drive_km"]), *_cells(sizes["up"], total["drive_km"]))
+        table.add_row(
+            kind_text(kind), *_cells(sizes["down"], total["drive_km"]), *_cells(sizes["up"], total["drive_km"])
+        )
     sums = (_cells(total[f"{way}_wire_bytes"], total["drive_km"]) for way in ("down", "up"))
     table.add_row("all", *(cell for cells in sums for cell in cells), style="bold")
     return table

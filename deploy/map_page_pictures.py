@@ -7,13 +7,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gnd.vehicle_agent.localise_drive.style import FAINT, INK, dress
+from gnd.picture_style import BLUE, CYCLE, DPI, FAINT, INK, PAPER, RED, SMALL_PT
+from gnd.vehicle_agent.localise_drive.style import dress
 from gnd.vehicle_agent.map_build.build import BuiltMap
 from gnd.vehicle_agent.map_build.quality import MOUNT_M, Quality
 
-DRIVES: Final = ("#2a6fbb", "#c8641a", "#007d79", "#8a3ffc", "#a98600")
-DOUBLE: Final = "#d1433f"
-_DPI: Final = 130
+DOUBLE: Final = RED
+_DRIVES: Final = tuple(one for one in CYCLE if one != DOUBLE)
 _THICKEST_M: Final = 0.12
 _MOST_DOTS: Final = 60_000
 
@@ -35,18 +35,18 @@ def map_picture(built: BuiltMap, quality: Quality) -> bytes:
         axes.plot(way[:, 0], way[:, 1], color=_colour(number), linewidth=1.2, label=source.header.drive_id)
     axes.set_aspect("equal")
     axes.set_xlabel("east, m", color=INK)
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
+    axes.legend(loc="upper right", fontsize=SMALL_PT, framealpha=0.9)
     return _png(figure)
 
 
 def thickness_picture(quality: Quality) -> bytes:
     """How thick planes are."""
     figure, axes = _figure(6.0, 3.2, "planes")
-    axes.hist(100 * quality.plane_sd_m.clip(0, _THICKEST_M), bins=48, color="#5b7fa6")
+    axes.hist(100 * quality.plane_sd_m.clip(0, _THICKEST_M), bins=48, color=BLUE)
     for share, value in zip((10, 50, 90), quality.thickness_m, strict=True):
         axes.axvline(100 * min(value, _THICKEST_M), color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
         axes.text(
-            100 * min(value, _THICKEST_M), 0.97, f" {share} %", transform=axes.get_xaxis_transform(), fontsize=8,
+            100 * min(value, _THICKEST_M), 0.97, f" {share} %", transform=axes.get_xaxis_transform(), fontsize=SMALL_PT,
             color=INK, va="top",
         )  # fmt: skip
     axes.set_xlabel(f"smallest sd, cm (all beyond {100 * _THICKEST_M:.0f} in the last bar)", color=INK)
@@ -63,16 +63,16 @@ def height_picture(built: BuiltMap, quality: Quality) -> bytes:
         axes.axhspan(mount.header_m - MOUNT_M, mount.header_m + MOUNT_M, color=_colour(number), alpha=0.08, linewidth=0)
         axes.axhline(mount.header_m, color=_colour(number), linewidth=1.0, linestyle=(0, (4, 3)))
     axes.set_xlabel("way, m (dashed: the header's mount; band: in bounds)", color=INK)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=SMALL_PT)
     return _png(figure)
 
 
 def _colour(number: int) -> str:
-    return DRIVES[number % len(DRIVES)]
+    return _DRIVES[number % len(_DRIVES)]
 
 
 def _figure(width_in: float, height_in: float, label: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor="white", layout="constrained")
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER, layout="constrained")
     axes = figure.add_subplot()
     dress(axes, label)
     axes.spines["bottom"].set_color(FAINT)

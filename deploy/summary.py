@@ -21,6 +21,7 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.settings import settings_sha256
 from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.tile_store.status import named_vehicles, waiting_totals
+from gnd.words import many
 
 
 def write_summary(
@@ -138,25 +139,27 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         summary["waiting_for_confirmation"],
     )
     lines = [
-        f"{summary['agents']} agent{'' if summary['agents'] == 1 else 's'} drove {summary['drive_km']:.2f} km"
-        f" on {summary['link']} links in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
-        f"{summary['reports_sent']} reports sent, {summary['reports_acknowledged']} acknowledged, "
-        f"{summary['reports_lost']} lost; {summary['tiles_published']} tile versions published, "
-        f"{summary['updates_received']} updates received, {summary['changed_voxels']} voxels changed",
+        f"{many(summary['agents'], 'agent')} drove {summary['drive_km']:.2f} km on {_links_text(summary['link'])} in"
+        f" {summary['wall_s']:.0f} s; {many(summary['tiles_downloaded'], 'tile')} downloaded",
+        f"{many(summary['reports_sent'], 'report')} sent, {summary['reports_acknowledged']} acknowledged, "
+        f"{summary['reports_lost']} lost; {many(summary['tiles_published'], 'tile version')} published, "
+        f"{many(summary['updates_received'], 'update')} received, {many(summary['changed_voxels'], 'voxel')} changed",
         *traffic_lines(traffic),
     ]
     if waiting["voxels"]:
         lines.append(
-            f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles: another vehicle that"
-            " finds the same confirms it (`gnd map status`)"
+            f"waiting for confirmation: {many(waiting['voxels'], 'voxel')} in {many(waiting['tiles'], 'tile')}: another"
+            " vehicle that finds the same confirms it (`gnd map status`)"
         )
     if waiting["parked"]:
         lines.append(
-            f"parked: {waiting['parked']} new voxels have the shape of a standing vehicle: they are published when they"
-            " have stood for long (`confirmation.parked_h`)"
+            f"parked: {many(waiting['parked'], 'new voxel')} with the shape of a standing vehicle: published after"
+            " standing for long (`confirmation.parked_h`)"
         )
     if waiting["season"]:
-        lines.append(f"season: {waiting['season']} changed voxels are leaves of trees that stayed: they change no map")
+        lines.append(
+            f"season: {many(waiting['season'], 'changed voxel')} of leaves of trees that stayed: no change of the map"
+        )
     lines += [one["says"] for one in summary["named_vehicles"]]
     if p95["longitudinal_m"] is not None:
         lines.append(
@@ -172,14 +175,19 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     lines += made_up_lines(summary.get("made_up"))
     lines += learning_lines(summary.get("learning", {}))
     lines += [
-        f"{vehicle} doubts itself: {d['scans_shifted'] + d['scans_taken_back']} scans taken back, "
-        f"{d['tiles_held_back']} tiles with {d['changes_held_back']} changes held back, {d['tiles_doubtful']} doubtful "
+        f"{vehicle} doubts itself: {many(d['scans_shifted'] + d['scans_taken_back'], 'scan')} taken back, "
+        f"{many(d['tiles_held_back'], 'tile')} with {many(d['changes_held_back'], 'change')} held back, "
+        f"{d['tiles_doubtful']} doubtful "
         f"({_reasons(d['tiles'])}); largest shift "
         f"{d['largest_shift_m'] * 100:.0f} cm, {d['largest_turn_deg']:.2f} degrees"
         for vehicle, d in summary.get("doubtful", {}).items()
     ]
     lines += feature_lines(summary.get("features", {}))
     return lines
+
+
+def _links_text(link: str) -> str:
+    return "links without a limit" if link == "none" else f"{link} links"
 
 
 def _reasons(tiles: dict[str, int]) -> str:

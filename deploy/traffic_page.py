@@ -14,10 +14,10 @@ from gnd.fleet_bus.traffic_table import notes
 
 _HOW = """<p>Payload is the content of the messages. On the wire are the bytes that the kernel counted on each
 vehicle's connection (TCP_INFO: stream and packet headers). Each of them is assigned: every message has its
-payload, key, envelope and packets; <b>acks</b> are packets without data (<b>tile acks</b> those that answer tiles, by
-the share of packets), <b>resent</b> is what was lost and sent again, <b>opening</b> and <b>closing</b> are those of
-connections, <b>keep-alives</b> what an idle session sends to stay open, and <b>session</b> is the rest: declarations,
-answers that arrived too late. A kind without messages of its own consists of shares of other messages: one answer may
+payload, key, envelope and packets; <b>TCP acks</b> are packets without data (<b>TCP acks of tiles</b> those that answer
+tiles, by the share of packets), <b>resent</b> is what was lost and sent again, <b>opening</b> and <b>closing</b> are
+those of connections, <b>keep-alives</b> what an idle session sends to stay open, and <b>session</b> is the rest:
+declarations, answers that arrived too late. A kind without messages of its own consists of shares of other messages: one answer may
 contain many tiles.</p>"""
 
 

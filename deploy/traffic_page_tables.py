@@ -8,7 +8,7 @@ from html import escape
 from gnd.deploy.html_page import card_list
 from gnd.deploy.live_traffic import size_text
 from gnd.fleet_bus.links import LinkProfile
-from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, is_of_tiles, per_km
+from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, is_of_tiles, kind_text, per_km
 
 PAPER_UP_KB_PER_KM = 56.32
 """Upload of the GND paper, kB/km (section 7.5 and abstract)."""
@@ -67,7 +67,7 @@ def _kind_cells(line: KindTraffic, drive_km: float) -> str:
         _kb(line.wire_bytes),
         _per_km(line.wire_bytes, drive_km),
     )
-    return f'<td class="t">{escape(line.kind)}</td><td class="t">{line.direction}</td>' + _cells(numbers)
+    return f'<td class="t">{escape(kind_text(line.kind))}</td><td class="t">{line.direction}</td>' + _cells(numbers)
 
 
 def _sums(agents: Sequence[AgentTraffic]) -> Iterable[str]:

@@ -15,6 +15,7 @@ from gnd.fleet_bus.traffic_wire import RESIDUES, TILE_KINDS, WireAccount, wire_a
 
 DEFAULT_LINKS: Final = ("3g", "4g", "5g")
 _TILES: Final = (*TILE_KINDS, "tile acks")
+_KIND_WORDS: Final = {"ack": "acknowledgement", "acks": "TCP acks", "tile acks": "TCP acks of tiles"}
 _SERIES_POINTS: Final = 100
 
 
@@ -100,6 +101,11 @@ class AgentTraffic:
     arrivals: Arrivals | None
     along: tuple[tuple[float, float, int, int], ...]
     ignored_lines: int
+
+
+def kind_text(kind: str) -> str:
+    """A kind of bytes for people: the acknowledgement of a report is no "ack" beside the "acks" of the connection."""
+    return _KIND_WORDS.get(kind, kind)
 
 
 def agent_traffic(ledger: AgentLedger, links: tuple[LinkProfile, ...]) -> AgentTraffic:

@@ -5,7 +5,8 @@ from collections.abc import Iterable
 from rich.console import Console
 from rich.table import Table
 
-from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, per_km
+from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, kind_text, per_km
+from gnd.words import many
 
 
 def print_tables(agents: tuple[AgentTraffic, ...], console: Console) -> None:
@@ -24,7 +25,9 @@ def notes(agents: tuple[AgentTraffic, ...]) -> list[str]:
     estimated = sum(agent.estimated_wire_bytes for agent in agents)
     lines = []
     if ignored:
-        lines.append(f"{ignored} unfinished ledger lines left out (a process was killed while writing, or damage)")
+        lines.append(
+            f"{many(ignored, 'unfinished ledger line')} left out (a process was killed while writing, or damage)"
+        )
     if estimated:
         lines.append(
             f"{estimated / 1000:.1f} kB on the wire are estimated: no reading of the connection covers them "
@@ -58,7 +61,7 @@ def _add(table: Table, agent: str, lines: Iterable[KindTraffic], drive_km: float
     for line in lines:
         app, wire = line.app_bytes, line.wire_bytes
         table.add_row(
-            agent, line.kind, line.direction, str(line.messages) if line.messages else "–",
+            agent, kind_text(line.kind), line.direction, str(line.messages) if line.messages else "–",
             f"{app / 1000:.3f}" if app else "–", _per_km(app, drive_km) if app else "–",
             f"{wire / 1000:.3f}", _per_km(wire, drive_km),
         )  # fmt: skip
@@ -88,7 +91,7 @@ def caption(agents: tuple[AgentTraffic, ...]) -> str:
     """The totals in one sentence."""
     total = fleet_totals(agents)
     return (
-        f"{total['agents']} agents, {total['drive_km']:.2f} km: "
+        f"{many(total['agents'], 'agent')}, {total['drive_km']:.2f} km: "
         f"down {total['down_bytes'] / 1000:.3f} kB ({total['kB_per_km_down']:.1f} kB/km), "
         f"up {total['up_bytes'] / 1000:.3f} kB ({total['kB_per_km_up']:.1f} kB/km); on the wire "
         f"down {total['down_wire_bytes'] / 1000:.3f} kB, up {total['up_wire_bytes'] / 1000:.3f} kB; "

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from gnd.fleet_sim.ellipsoids import Ellipsoids, Tiles, ellipsoids_of_maps, ellipsoids_of_truth
 from gnd.fleet_sim.errors import SimError
 from gnd.fleet_sim.truth import Truth
-from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
+from gnd.gnd_map.classes import ChangeClass
+from gnd.picture_style import INK, LABEL_PT, MUTED, NOTE_PT, PAPER, SAFE_COLOURS, SMALL_PT, TITLE_PT, write_png
 
 FloatArray = NDArray[np.float64]
 Colours = Mapping[ChangeClass, str]
@@ -28,13 +29,11 @@ _SIGMAS: Final = 1.9
 """Drawn size: an evenly filled plane across a 1 m voxel just reaches the neighbouring voxel's."""
 _SHOWN: Final = (ChangeClass.NORMAL, ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
 _SUN: Final = np.array([-0.35, -0.5, 0.79])
-_INK: Final = "#1c2430"
-_PAPER: Final = "#ffffff"
 _SKY: Final = "#e9eef5"
 _HALF_WIDTH_M: Final = 24.0
 _NEAR_M: Final = 4.0
 _FOCAL: Final = 1.75
-_HALO: Final = [withStroke(linewidth=3.0, foreground=_PAPER)]
+_HALO: Final = [withStroke(linewidth=3.0, foreground=PAPER)]
 _WIDTH_IN: Final = 12.6
 _MARGIN_IN: Final = 0.378
 _PANEL_IN: Final = 0.94 * _WIDTH_IN
@@ -45,7 +44,7 @@ _GAP_IN: Final = 0.126
 _FOOT_IN: Final = 0.21
 _LONGEST_ROW_M: Final = 260.0
 """A longer street is shown from above in several rows."""
-_ARROW: Final = {"arrowstyle": "-|>", "color": _INK, "linewidth": 1.6}
+_ARROW: Final = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.6}
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +109,7 @@ def map_figure(
     note: str = "",
     view: StreetView | None = None,
     dpi: int = _DPI,
-    colours: Colours = CLASS_COLOURS,
+    colours: Colours = SAFE_COLOURS,
 ) -> Figure:
     """Draw a map from above and in perspective, with legend and scale.
 
@@ -123,14 +122,14 @@ def map_figure(
         note: small line below the heading.
         view: the same view for several pictures makes them comparable; by default it is fitted.
         dpi: dots an inch; the picture is 12.6 inches wide.
-        colours: of the classes; by default the paper's.
+        colours: of the classes.
     """
     view = view or StreetView.around(ellipsoids)
     rows = view.rows()
     height_in = _HEAD_IN + len(rows) * (_ROW_IN + _GAP_IN) + _PERSPECTIVE_IN + _FOOT_IN
-    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=dpi, facecolor=_PAPER)
-    figure.text(0.03, 1.0 - 0.361 / height_in, title, fontsize=19, weight="bold", color=_INK, va="center")
-    figure.text(0.03, 1.0 - 0.655 / height_in, note, fontsize=11, color="#5a6675", va="center")
+    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=dpi, facecolor=PAPER)
+    figure.text(0.03, 1.0 - 0.361 / height_in, title, fontsize=TITLE_PT, weight="bold", color=INK, va="center")
+    figure.text(0.03, 1.0 - 0.655 / height_in, note, fontsize=NOTE_PT, color=MUTED, va="center")
     _legend(figure, 1.0 - 0.353 / height_in, ellipsoids, colours)
     for index, row in enumerate(rows):
         bottom_in = height_in - _HEAD_IN - (index + 1) * _ROW_IN - index * _GAP_IN
@@ -189,10 +188,10 @@ def draw_healing(truth: Truth, base: Tiles, final: Tiles, path: Path) -> None:
         ("Map after", ellipsoids_of_maps(truth.frame, base, final)),
         ("Truth", true),
     )
-    figure = Figure(figsize=(12.6, 9.6), dpi=_DPI // 2, facecolor=_PAPER)
+    figure = Figure(figsize=(12.6, 9.6), dpi=_DPI // 2, facecolor=PAPER)
     _legend(figure, 0.958)
     for row, (title, ellipsoids) in enumerate(panels):
-        figure.text(0.03, 0.957 - 0.315 * row, title, fontsize=17, weight="bold", color=_INK, va="center")
+        figure.text(0.03, 0.957 - 0.315 * row, title, fontsize=TITLE_PT, weight="bold", color=INK, va="center")
         _from_above(figure.add_axes((0.03, 0.667 - 0.315 * row, 0.94, 0.27)), ellipsoids, view)
     save_figure(figure, path)
 
@@ -203,17 +202,14 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         SimError: it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.part")
     try:
-        with partial.open("wb") as file:
-            figure.savefig(file, format="png")
-        partial.replace(path)
+        write_png(figure, path)
     except OSError as error:
         raise SimError(f"cannot write the picture {path}: {error}") from error
 
 
 def _legend(
-    figure: Figure, height: float, ellipsoids: Ellipsoids | None = None, colours: Colours = CLASS_COLOURS
+    figure: Figure, height: float, ellipsoids: Ellipsoids | None = None, colours: Colours = SAFE_COLOURS
 ) -> None:
     """The colours, with the number of ellipsoids of each where they are given."""
     number = ["" for _ in ChangeClass]
@@ -223,12 +219,12 @@ def _legend(
     dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 9}
     handles = [Line2D([], [], color=colours[c], label=f"{c.name.lower()}{number[c]}", **dot) for c in _SHOWN]
     figure.legend(
-        handles=handles, loc="center right", bbox_to_anchor=(0.978, height), ncols=4, frameon=False, fontsize=11,
-        handletextpad=0.2, columnspacing=1.4, labelcolor=_INK,
+        handles=handles, loc="center right", bbox_to_anchor=(0.978, height), ncols=4, frameon=False, fontsize=LABEL_PT,
+        handletextpad=0.2, columnspacing=1.4, labelcolor=INK,
     )  # fmt: skip
 
 
-def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: StreetView, palette: Colours = CLASS_COLOURS) -> None:
+def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: StreetView, palette: Colours = SAFE_COLOURS) -> None:
     R = view.R_view_map
     mean, cov = (ellipsoids.mean_m - np.array(view.origin_m)) @ R.T, R @ ellipsoids.cov_m2 @ R.T
     inside = np.flatnonzero((np.abs(mean[:, 0]) < view.half_length_m) & (np.abs(mean[:, 1]) < _HALF_WIDTH_M))
@@ -237,7 +233,7 @@ def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: StreetView, palette: C
     add_ellipses(axes, mean[order, :2], cov[order, :2, :2], colours)
     half_width = view.half_length_m * _ROW_IN / _PANEL_IN
     axes.set(xlim=(-view.half_length_m, view.half_length_m), ylim=(-half_width, half_width), aspect="equal")
-    _frame(axes, _PAPER)
+    _frame(axes, PAPER)
     _scale_bar(axes, view, half_width)
     _north(axes, view, half_width)
 
@@ -271,7 +267,7 @@ def _looking(eye: FloatArray, target: FloatArray) -> FloatArray:
 
 
 def shaded(
-    cov: FloatArray, change_class: NDArray[np.uint8], sun: FloatArray, palette: Colours = CLASS_COLOURS
+    cov: FloatArray, change_class: NDArray[np.uint8], sun: FloatArray, palette: Colours = SAFE_COLOURS
 ) -> FloatArray:
     """Colours (N, 3): the class's, lighter where the flat side of the ellipsoid faces the sun."""
     base: FloatArray = np.array([to_rgb(palette[c]) for c in ChangeClass])[change_class]
@@ -308,8 +304,8 @@ def _frame(axes: Axes, background: str) -> None:
 def _scale_bar(axes: Axes, view: StreetView, half_width: float) -> None:
     length = 20.0 if view.half_length_m > 40 else 10.0
     x, y = -view.half_length_m + 0.025 * 2 * view.half_length_m, -half_width * 0.84
-    axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.5, solid_capstyle="butt")
-    place: dict[str, Any] = {"ha": "center", "va": "bottom", "color": _INK, "path_effects": _HALO}
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
+    place: dict[str, Any] = {"ha": "center", "va": "bottom", "color": INK, "path_effects": _HALO}
     axes.text(x + length / 2, y + half_width * 0.045, f"{length:.0f} m", **place)
 
 
@@ -318,5 +314,5 @@ def _north(axes: Axes, view: StreetView, half_width: float) -> None:
     direction = view.R_view_map @ np.array([0.0, 1.0, 0.0])
     end = size / 2 * direction[:2]
     axes.annotate("", (x + end[0], y + end[1]), (x - end[0], y - end[1]), arrowprops=_ARROW)
-    place: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9, "color": _INK, "path_effects": _HALO}
+    place: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL_PT, "color": INK, "path_effects": _HALO}
     axes.text(x + 1.35 * end[0], y + 1.35 * end[1], "N", **place)

@@ -10,6 +10,7 @@ import numpy as np
 from gnd.gnd_map.arrays import F32, F64
 from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.se3 import transform
+from gnd.picture_style import BLUE, GREEN, GREY, ORANGE, RED, SMALL_PT, styled, write_png
 from gnd.schemas.drive import U32
 from gnd.vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays
 from gnd.vehicle_agent.importer import FORMATS, no_progress
@@ -111,26 +112,23 @@ def _away(pole: Pole, scan: RealScan) -> float:
     return float(np.hypot(*(pole.xy_m - scan.T_map_vehicle[:2, 3])))
 
 
-COLOURS: Final = {"pole": "#1f77b4", "streetlight": "#ff7f0e", "traffic_sign": "#d62728", "trunk": "#2ca02c"}
+COLOURS: Final = {"pole": BLUE, "streetlight": ORANGE, "traffic_sign": RED, "trunk": GREEN}
 REACH_M: Final = 42.0
 SIDE_M: Final = 2.5
 """Half the width of a side view."""
 
 
+@styled
 def draw_poles(scan: RealScan, poles: Sequence[Pole], title: str, path: Path) -> Path:
     """Draw a scan from above, the vehicle in the middle, and side views of its nearest poles; write a PNG."""
-    import matplotlib as mpl
+    from matplotlib.figure import Figure
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure = plt.figure(figsize=(15.0, 9.0), layout="constrained")
+    figure = Figure(figsize=(15.0, 9.0), layout="constrained")
     grid = figure.add_gridspec(3, 8)
     _from_above(figure.add_subplot(grid[:, :5]), scan, poles, title)
     for number, pole in enumerate(poles[:9]):
         _from_the_side(figure.add_subplot(grid[number // 3, 5 + number % 3]), scan, pole, number)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    write_png(figure, path)
     return path
 
 
@@ -144,12 +142,12 @@ def _from_above(axes: Any, scan: RealScan, poles: Sequence[Pole], title: str) ->
         x, y = pole.xy_m - scan.T_map_vehicle[:2, 3]
         colour = COLOURS[pole.kind]
         axes.plot(x, y, "o", mfc="none", mec=colour, ms=11, mew=1.6)
-        axes.annotate(str(number), (x, y), xytext=(6, 6), textcoords="offset points", color=colour, fontsize=9)
+        axes.annotate(str(number), (x, y), xytext=(6, 6), textcoords="offset points", color=colour, fontsize=SMALL_PT)
     for kind, colour in COLOURS.items():
         axes.plot([], [], "o", mfc="none", mec=colour, label=kind)
     axes.plot(0.0, 0.0, "k^", ms=8)
     axes.set(xlim=(-REACH_M, REACH_M), ylim=(-REACH_M, REACH_M), aspect="equal", title=title, xlabel="m", ylabel="m")
-    axes.legend(loc="upper right", fontsize=8)
+    axes.legend(loc="upper right")
 
 
 def _from_the_side(axes: Any, scan: RealScan, pole: Pole, number: int) -> None:
@@ -162,7 +160,7 @@ def _from_the_side(axes: Any, scan: RealScan, pole: Pole, number: int) -> None:
     height = scan.rays.points_m[:, 2] - pole.foot_z_m
     near = (np.abs(across) < SIDE_M) & (np.abs(along) < SIDE_M) & (height < 9.0)
     core = near & (np.hypot(*off.T) < 0.5 * pole.diameter_m + 0.2)
-    axes.scatter(across[near], height[near], s=1.5, c="0.6", linewidths=0)
+    axes.scatter(across[near], height[near], s=1.5, c=GREY, linewidths=0)
     axes.scatter(across[core], height[core], s=3.0, c=COLOURS[pole.kind], linewidths=0)
     axes.set(xlim=(-SIDE_M, SIDE_M), ylim=(-0.5, 8.0))
     axes.set_title(f"{number}: {pole.kind}, {distance:.0f} m, Ø {pole.diameter_m:.2f} m", fontsize=8)

@@ -1,8 +1,8 @@
 """Install the packages of dist/ into fresh environments, and run real work there, far from the checkout.
 
 For each Python: the wheel with `[all]`, and a small job from end to end: a street is simulated and mapped, boxes are
-put into it, a fleet of two vehicles finds them over real sessions, and its run is reported and served as a page. Then the source
-archive is built and installed into an environment of its own, which must come to hold the same files.
+put into it, a fleet of two vehicles finds them over real sessions, and its run is reported and served as a page. Then
+the source archive is built and installed into an environment of its own, which must come to hold the same files.
 """
 
 import json
@@ -92,8 +92,8 @@ def small_job(environment: Environment) -> dict[str, object]:
     gnd("gnd", "map", "build", "-o", "map.sqlite", "before.mcap")
     gnd("gnd", "map", "verify", "map.sqlite")
     gnd(
-        "gnd", "fleet", "--drives", "before.mcap", "--made-up", "4", "--map", "map.sqlite", "--agents", "2", "--shards", "1",
-        "--out", "run", "--link", "none", "--no-page",
+        "gnd", "fleet", "--drives", "before.mcap", "--made-up", "4", "--map", "map.sqlite", "--agents", "2",
+        "--shards", "1", "--out", "run", "--link", "none", "--no-page",
     )  # fmt: skip
     gnd("gnd", "report", "run")
     gnd("gnd", "traffic", "run")

@@ -16,14 +16,14 @@ import click
 from tools.changelog import ROOT
 
 PYTHONS: Final = ("3.11", "3.12", "3.13")
+_GLIBC: Final = range(17, 37)
+"""Minor versions of glibc 2 up to that of Debian 12."""
 MACHINES: Final = {
-    "Linux x86-64": ("manylinux_2_28_x86_64", "manylinux_2_27_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64"),
-    "Linux arm64": (
-        "manylinux_2_28_aarch64", "manylinux_2_27_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64",
-    ),
+    "Linux x86-64": tuple(f"manylinux_2_{n}_x86_64" for n in _GLIBC),
+    "Linux arm64": tuple(f"manylinux_2_{n}_aarch64" for n in _GLIBC),
     "macOS arm64": ("macosx_15_0_arm64",),
     "macOS Intel": ("macosx_15_0_x86_64",),
-}  # fmt: skip
+}
 EXTRAS: Final = (
     "base", "vehicle", "lanes", "cloud", "sim", "serve", "ros", "import", "export", "objects", "postgres", "opendrive",
 )  # fmt: skip

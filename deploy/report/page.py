@@ -1,5 +1,6 @@
 """The page of a report: one HTML file, nothing from elsewhere, light and dark, on paper always light."""
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from pathlib import Path
@@ -19,6 +20,7 @@ from gnd.fleet_bus.settings_file import SETTINGS_FILE
 from gnd.fleet_bus.traffic import fleet_totals
 
 _MOST_TILES: Final = 300
+_BACKTICKS: Final = re.compile(r"`([^`]+)`")
 _MORE_STYLE: Final = """
 figure img{display:block;width:100%;max-width:60rem;height:auto;border-radius:.5rem;background:#fff}
 h3{font-size:1rem;margin:1.2rem 0 .1rem}
@@ -128,7 +130,12 @@ def _summary(run: FinishedRun) -> str:
         lines = summary_lines(run.summary)
     except (KeyError, TypeError, ValueError):
         return '<p class="note">The summary of the run is damaged, or of another version of this program.</p>'
-    return f'<ul class="said">{"".join(f"<li>{escape(line)}</li>" for line in lines)}</ul>'
+    return f'<ul class="said">{"".join(f"<li>{_with_code(line)}</li>" for line in lines)}</ul>'
+
+
+def _with_code(line: str) -> str:
+    """A line as HTML; what stands between backticks is a command or a setting."""
+    return _BACKTICKS.sub(r"<code>\1</code>", escape(line))
 
 
 def _maps(states: MapStates | None) -> str:

@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from gnd.deploy.map_export.changes import Change
-from gnd.deploy.report.colours import SAFE_COLOURS
 from gnd.deploy.report.finished_run import FinishedRun
 from gnd.fleet_sim.ellipsoids import Ellipsoids, Tiles, ellipsoids_of_maps, ellipsoids_of_truth
 from gnd.fleet_sim.pictures import StreetView, add_ellipses, map_figure, shaded
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.geodesy import LocalFrame
+from gnd.picture_style import BLUE, FAINT, GRID, INK, SAFE_COLOURS
 
 _MAP_DPI: Final = 100
 _PATCH_DPI: Final = 110
@@ -27,8 +27,6 @@ _LEAST_HALF_M: Final = 5.0
 _MOST_HALF_M: Final = 40.0
 _ELEVATION_RAD: Final = np.radians(38.0)
 _SUN: Final = np.array([-0.35, -0.5, 0.79])
-_INK: Final = "#1c2430"
-_EDGE: Final = "#c3ccd8"
 _HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -78,10 +76,7 @@ def map_pictures(states: MapStates) -> list[tuple[str, bytes]]:
     ]
     if states.truth is not None:
         shown.append(("Truth", "what really changed", states.truth))
-    return [
-        (f"{title}: {note}", _png(map_figure(one, title, note, view, _MAP_DPI, SAFE_COLOURS)))
-        for title, note, one in shown
-    ]
+    return [(f"{title}: {note}", _png(map_figure(one, title, note, view, _MAP_DPI))) for title, note, one in shown]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +121,7 @@ def change_picture(change: Change, states: MapStates) -> bytes:
     for number, (title, one) in enumerate(panels):
         axes = figure.add_axes((number / len(panels) + 0.004, 0.01, 1 / len(panels) - 0.008, 0.9))
         _draw_patch(axes, one, view)
-        axes.set_title(title, fontsize=9, color=_INK, pad=3)
+        axes.set_title(title, fontsize=9, color=INK, pad=3)
     return _png(figure)
 
 
@@ -146,15 +141,15 @@ def _draw_patch(axes: Axes, ellipsoids: Ellipsoids, view: PatchView) -> None:
     add_ellipses(axes, place[order, :2], cov[:, :2, :2], colours)
     axes.set(xlim=(-view.half_m, view.half_m), ylim=(-view.half_m, view.half_m), aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
-        spine.set(color=_EDGE, linewidth=0.8)
+        spine.set(color=FAINT, linewidth=0.8)
     _scale(axes, view.half_m)
 
 
 def _scale(axes: Axes, half_m: float) -> None:
     length = next((one for one in (20.0, 10.0, 5.0) if one < 0.8 * half_m), 2.0)
     x, y = -0.93 * half_m, -0.93 * half_m
-    axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.0, solid_capstyle="butt")
-    place: dict[str, Any] = {"ha": "left", "va": "bottom", "fontsize": 7, "color": _INK, "path_effects": _HALO}
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=2.0, solid_capstyle="butt")
+    place: dict[str, Any] = {"ha": "left", "va": "bottom", "fontsize": 7, "color": INK, "path_effects": _HALO}
     axes.text(x, y + 0.03 * half_m, f"{length:g} m", **place)
 
 
@@ -168,13 +163,13 @@ def errors_picture(vehicles: Sequence[tuple[F64, F64, F64]]) -> bytes:
     for row, label in enumerate(("along, cm", "across, cm")):
         axes = figure.add_subplot(2, 1, row + 1)
         for t_s, *errors in vehicles:
-            axes.plot(t_s, 100 * errors[row], linewidth=0.8, color="#0072b2", alpha=0.6)
-        axes.set_ylabel(label, color=_INK, fontsize=9)
-        axes.grid(color="#e3e7ed", linewidth=0.8)
-        axes.tick_params(colors=_INK, labelsize=8)
+            axes.plot(t_s, 100 * errors[row], linewidth=0.8, color=BLUE, alpha=0.6)
+        axes.set_ylabel(label, color=INK, fontsize=9)
+        axes.grid(color=GRID, linewidth=0.8)
+        axes.tick_params(colors=INK, labelsize=8)
         for name, spine in axes.spines.items():
-            spine.set(visible=name in ("left", "bottom"), color=_EDGE)
-    axes.set_xlabel("time of the drive, s", color=_INK, fontsize=9)
+            spine.set(visible=name in ("left", "bottom"), color=FAINT)
+    axes.set_xlabel("time of the drive, s", color=INK, fontsize=9)
     return _png(figure)
 
 

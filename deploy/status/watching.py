@@ -35,6 +35,10 @@ _SHARE: Final = 0.1
 """Looking may take this part of the time, however large the store is."""
 
 
+_NO_SHARD: Final = "GndNoShard"
+"""A run that has ended has no shards, and misses none."""
+
+
 @dataclass(slots=True)
 class OperatorRoom:
     """What is looked at, and the look before.
@@ -68,7 +72,9 @@ class OperatorRoom:
             self.close()
             raise
         before, self._before = self._before, figures
-        return RoomView(figures, tuple(raised_by(figures, self.thresholds)), _rate(before, figures))
+        ended = self.run is not None and self.run.summary.exists()
+        raised = (one for one in raised_by(figures, self.thresholds) if not (ended and one.alert == _NO_SHARD))
+        return RoomView(figures, tuple(raised), _rate(before, figures))
 
     def close(self) -> None:
         """Close the store."""

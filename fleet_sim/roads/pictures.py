@@ -7,8 +7,8 @@ import numpy as np
 
 from gnd.fleet_sim.roads.curve import FloatArray
 from gnd.fleet_sim.roads.drive import RoadDrive
+from gnd.picture_style import FAINT, FEATURE_COLOURS, GREY, INK, MUTED, ORANGE, SMALL_PT, styled, write_png
 
-_COLOURS: Final = {"normal": "#1f5fbf", "deleted": "#2e9e4f", "new": "#d62728"}
 _STRETCH_M: Final = 150.0
 
 
@@ -23,6 +23,7 @@ def detection_places(drive: RoadDrive) -> tuple[FloatArray, FloatArray]:
     return places, np.concatenate(drive.truth.of_detection)
 
 
+@styled
 def draw_drive(drive: RoadDrive, png: Path, *, dpi: int = 75) -> None:
     """Draw a drive: the route, its most crowded stretch, the looks at each feature, the error of the GNSS."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -38,24 +39,25 @@ def draw_drive(drive: RoadDrive, png: Path, *, dpi: int = 75) -> None:
     seen = int((drive.truth.looks_at > 0).sum())
     figure.suptitle(
         f"{drive.route.name}, drive {drive.seed}: {drive.route.length_m:.0f} m, {len(drive.looks)} looks,"
-        f" {seen} of {len(drive.route.features)} features in sight"
-    )
-    figure.savefig(png)
+        f" {seen} of {len(drive.route.features)} features in sight",
+        x=0.012, ha="left",
+    )  # fmt: skip
+    write_png(figure, png)
 
 
 def _whole(ax: Any, drive: RoadDrive) -> None:
     features = drive.route.features
-    ax.plot(*drive.route.line.xy_m.T, color="0.7", lw=1)
+    ax.plot(*drive.route.line.xy_m.T, color=GREY, lw=1)
     _dots(ax, drive, features.xy_m, 14)
-    ax.plot(*drive.gnss.xy_m.T, ",", color="0.4")
-    ax.set_title("route [m]; " + ", ".join(f"{len(features.rows(s))} {s}" for s in _COLOURS))  # type: ignore[arg-type]
+    ax.plot(*drive.gnss.xy_m.T, ",", color=MUTED)
+    ax.set_title("route [m]; " + ", ".join(f"{len(features.rows(s))} {s}" for s in FEATURE_COLOURS))  # type: ignore[arg-type]
     ax.set_aspect("equal")
-    ax.legend(loc="best", fontsize=8)
+    ax.legend(loc="best", fontsize=SMALL_PT)
 
 
 def _dots(ax: Any, drive: RoadDrive, xy_m: FloatArray, size: float) -> None:
     states = np.array(drive.route.features.states)
-    for state, colour in _COLOURS.items():
+    for state, colour in FEATURE_COLOURS.items():
         rows = states == state
         if rows.any():
             ax.scatter(
@@ -75,27 +77,27 @@ def _stretch(ax: Any, drive: RoadDrive) -> None:
         return np.asarray((xy - pose[:2]) @ np.array([[c, -s], [s, c]]))
 
     for marking in drive.route.lanes():
-        ax.plot(*along(marking).T, color="0.75", lw=0.8)
+        ax.plot(*along(marking).T, color=FAINT, lw=0.8)
     places, of = detection_places(drive)
-    ax.plot(*along(places[of > 0]).T, ".", ms=2, color="#ff9f1c", label="detections, from true poses")
-    ax.plot(*along(places[of == 0]).T, "+", ms=4, color="0.3", label="false alarms")
-    ax.plot(*along(poses[:, :2]).T, color="black", lw=1, label="drive")
+    ax.plot(*along(places[of > 0]).T, ".", ms=2, color=ORANGE, label="detections, from true poses")
+    ax.plot(*along(places[of == 0]).T, "+", ms=4, color=MUTED, label="false alarms")
+    ax.plot(*along(poses[:, :2]).T, color=INK, lw=1, label="drive")
     _dots(ax, drive, along(features.xy_m), 30)
     ax.set_xlim(-_STRETCH_M / 2, _STRETCH_M / 2)
     ax.set_ylim(-30, 30)
     ax.set_title("its most crowded stretch, along the road [m]")
-    ax.legend(loc="best", fontsize=7)
+    ax.legend(loc="best", fontsize=SMALL_PT)
 
 
 def _visibility(ax: Any, drive: RoadDrive) -> None:
     truth = drive.truth
     index = np.arange(len(drive.route.features))
-    ax.bar(index, truth.in_view.sum(axis=0), color="0.8", label="in the field of view, hidden")
-    colours = [_COLOURS[state] for state in drive.route.features.states]
+    ax.bar(index, truth.in_view.sum(axis=0), color=FAINT, label="in the field of view, hidden")
+    colours = [FEATURE_COLOURS[state] for state in drive.route.features.states]
     ax.bar(index, truth.looks_at, color=colours, label="in sight")
     ax.set_title("looks at each feature, or at the place of a deleted one, along the way")
     ax.set_xlabel("feature")
-    ax.legend(loc="best", fontsize=8)
+    ax.legend(loc="best", fontsize=SMALL_PT)
 
 
 def _gnss(ax: Any, drive: RoadDrive) -> None:
@@ -105,4 +107,4 @@ def _gnss(ax: Any, drive: RoadDrive) -> None:
     for error, name in zip((gnss.xy_m - true).T, ("east", "north"), strict=True):
         ax.plot(t_s, error, lw=0.8, label=name)
     ax.set_title("error of the GNSS [m] over time [s]")
-    ax.legend(loc="best", fontsize=8)
+    ax.legend(loc="best", fontsize=SMALL_PT)

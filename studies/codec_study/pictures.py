@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from studies.frame.figures import BLUE, GREY, INK, dress, finish, new_figure
+from gnd.picture_style import BLUE, GREY, INK
+from studies.frame.figures import dress, finish, new_figure
 
 
 def draw(found: Mapping[str, Any], folder: Path) -> Path:

@@ -7,39 +7,45 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gnd.fleet_sim.pictures import save_figure
+from gnd.picture_style import (
+    DPI,
+    FAINT,
+    GRID,
+    INK,
+    LABEL_PT,
+    MUTED,
+    NOTE_PT,
+    PANEL_PT,
+    PAPER,
+    SMALL_PT,
+    TITLE_PT,
+)
 
-INK: Final = "#1c2430"
-PALE: Final = "#5a6675"
-GREEN: Final = "#2e8b57"
-BLUE: Final = "#2f6fb5"
-MAGENTA: Final = "#c2378f"
-ORANGE: Final = "#e08a1e"
-RED: Final = "#d1433f"
-GREY: Final = "#8a94a3"
-"""Green without HD map, blue with it, magenta for the integration, orange for lanes: as in the papers."""
+PALE: Final = MUTED
+"""Of the colours, green is without HD map, blue with it, magenta the integration, orange lanes: as in the papers."""
 
 
 def new_figure(wide_in: float, tall_in: float) -> Figure:
     """Return an empty figure."""
-    return Figure(figsize=(wide_in, tall_in), dpi=130, facecolor="white", layout="constrained")
+    return Figure(figsize=(wide_in, tall_in), dpi=DPI, facecolor=PAPER, layout="constrained")
 
 
 def dress(axes: Axes, x: str, y: str, title: str = "") -> None:
     """Name the axes, draw a faint grid, leave out the frame."""
-    axes.set_xlabel(x, color=INK)
-    axes.set_ylabel(y, color=INK)
+    axes.set_xlabel(x, color=INK, fontsize=LABEL_PT)
+    axes.set_ylabel(y, color=INK, fontsize=LABEL_PT)
     if title:
-        axes.set_title(title, loc="left", color=INK, fontsize=11, weight="bold")
-    axes.grid(visible=True, color="#e6eaf0", linewidth=0.7)
+        axes.set_title(title, loc="left", color=INK, fontsize=PANEL_PT, weight="bold")
+    axes.grid(visible=True, color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.tick_params(colors=INK, labelsize=9)
+    axes.tick_params(colors=INK, labelsize=SMALL_PT)
     spines(axes)
 
 
 def spines(axes: Axes, *shown: str) -> None:
     """Leave of the frame only some sides, by default the left and the lower one."""
     for name, spine in axes.spines.items():
-        spine.set(visible=name in (shown or ("left", "bottom")), color="#c3ccd8")
+        spine.set(visible=name in (shown or ("left", "bottom")), color=FAINT)
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -59,7 +65,7 @@ def finish(figure: Figure, title: str, note: str, path: Path) -> Path:
     Raises:
         SimError: it cannot be written.
     """
-    figure.suptitle(f"{title}\n", x=0.012, ha="left", fontsize=14, weight="bold", color=INK)
+    figure.suptitle(f"{title}\n", x=0.012, ha="left", fontsize=TITLE_PT, weight="bold", color=INK)
     top = 1.0 - 0.42 / figure.get_figheight()
-    figure.text(0.0125, top, note, fontsize=9, color=PALE, va="center")
+    figure.text(0.0125, top, note, fontsize=NOTE_PT, color=PALE, va="center")
     return save(figure, path)

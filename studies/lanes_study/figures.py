@@ -9,7 +9,8 @@ from gnd.deploy.lane_edits import map_pieces
 from gnd.fleet_sim.markings import FloatArray, Paint
 from gnd.gnd_map.features import Feature, geodetic_in_tile
 from gnd.gnd_map.tile_id import TileId
-from studies.frame.figures import BLUE, GREY, MAGENTA, ORANGE, dress, finish, new_figure
+from gnd.picture_style import BLUE, GREY, MAGENTA, ORANGE
+from studies.frame.figures import dress, finish, new_figure
 from studies.lanes_study.driving import LaneDrive, LaneTask, hd_map
 from studies.lanes_study.merging import fresh_layer, map_edits
 

@@ -17,10 +17,11 @@ import numpy as np
 from gnd.fleet_sim.markings import FloatArray
 from gnd.gnd_map.features.lane_pieces import beside
 from gnd.gnd_map.geodesy import LocalFrame
+from gnd.picture_style import BLUE, GREY, ORANGE
 from gnd.vehicle_agent.features.lanes.lane_mapper import DrivenBorder, LaneMapper
 from gnd.vehicle_agent.features.lanes.paint import PaintLook, paint_look
 from studies.frame.errors import RealDataError
-from studies.frame.figures import BLUE, GREY, ORANGE, dress, finish, new_figure
+from studies.frame.figures import dress, finish, new_figure
 
 _MOUNT_M: Final = 1.73
 """KITTI's LiDAR above the road."""

@@ -22,7 +22,8 @@ from gnd.fleet_sim.truth import Truth, read_truth
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
-from studies.frame.figures import INK, PALE, save, spines
+from gnd.picture_style import BLUE, DPI, FAINT, GREY, INK, MAGENTA, NOTE_PT, PANEL_PT, PAPER, RED, TITLE_PT
+from studies.frame.figures import PALE, save, spines
 from studies.localisation_study.series import PAPER_LIMITS, PoseSeries
 from studies.localisation_study.summary import (
     ROWS,
@@ -33,10 +34,6 @@ from studies.localisation_study.summary import (
 
 _GREEN: Final = "#cfeccb"
 _YELLOW: Final = "#fff1b8"
-_BROWN: Final = "#9a6a3c"
-_RED: Final = "#d1282e"
-_GREY: Final = "#76808e"
-_PURPLE: Final = "#8455a8"
 _NAMES: Final = (("longitudinal", "m", 1.0), ("lateral", "m", 1.0), ("heading", "°", 1.0))
 _ENLARGED: Final = (("longitudinal", "cm", 100.0), ("lateral", "cm", 100.0), ("heading", "°", 1.0))
 """Name, unit, and how many of it are a metre or a degree."""
@@ -56,13 +53,13 @@ class Curve:
 
 
 _SUBMAPS: Final = (
-    Curve("without_submap", "without submap", _BROWN),
-    Curve("with_submap", "with submap", _RED),
+    Curve("without_submap", "without submap", BLUE),
+    Curve("with_submap", "with submap", RED),
 )
 _UPDATE: Final = (
-    Curve("online", "online, outdated map", _BROWN),
-    Curve("after_update", "online, updated map", _RED),
-    Curve("fresh", "online, fresh map", _GREY, 1.0),
+    Curve("online", "online, outdated map", BLUE),
+    Curve("after_update", "online, updated map", RED),
+    Curve("fresh", "online, fresh map", GREY, 1.0),
 )
 _PICTURES: Final = (
     ("submaps", "Localisation in a changed world, final poses", _SUBMAPS),
@@ -116,14 +113,14 @@ def _draw(
     path: Path,
 ) -> None:
     """Draw three rows of errors, against the limits on the left and enlarged on the right."""
-    figure = Figure(figsize=(13.0, 8.4), dpi=130, facecolor="white")
+    figure = Figure(figsize=(13.0, 8.4), dpi=DPI, facecolor=PAPER)
     grid = figure.add_gridspec(
         4, 2, height_ratios=(0.28, 1, 1, 1), left=0.06, right=0.985, top=0.835, bottom=0.065, hspace=0.14, wspace=0.14
     )
     for column, titled in enumerate(("against the limits; numbers: 95 % / largest", "enlarged")):
         top = figure.add_subplot(grid[0, column])
         _draw_share(top, share, named=column == 0)
-        top.set_title(titled, fontsize=11, color=INK, loc="left", weight="bold")
+        top.set_title(titled, fontsize=PANEL_PT, color=INK, loc="left", weight="bold")
         for quantity in range(3):
             axes = figure.add_subplot(grid[quantity + 1, column], sharex=top)
             _draw_errors(axes, series, quantity, start_ns, enlarged=column == 1)
@@ -132,16 +129,16 @@ def _draw(
         axes.set_xlabel("seconds since the drive began", color=INK)
     figure.align_ylabels()
     _legend(figure, series)
-    figure.text(0.025, 0.965, head[0], fontsize=16, weight="bold", color=INK, va="center")
-    figure.text(0.025, 0.930, head[1], fontsize=10, color=PALE, va="center")
+    figure.text(0.025, 0.965, head[0], fontsize=TITLE_PT, weight="bold", color=INK, va="center")
+    figure.text(0.025, 0.930, head[1], fontsize=NOTE_PT, color=PALE, va="center")
     save(figure, path)
 
 
 def _draw_share(axes: Axes, share: tuple[F64, F64], *, named: bool) -> None:
     """Draw the share of what is near that has changed."""
     t_s, changed = share
-    axes.fill_between(t_s, 100 * changed, color=_PURPLE, alpha=0.3, linewidth=0)
-    axes.fill_between(t_s, 100 * changed, where=changed > _MUCH, color=_PURPLE, alpha=0.6, linewidth=0)
+    axes.fill_between(t_s, 100 * changed, color=MAGENTA, alpha=0.3, linewidth=0)
+    axes.fill_between(t_s, 100 * changed, where=changed > _MUCH, color=MAGENTA, alpha=0.6, linewidth=0)
     axes.set_xlim(t_s[0], t_s[-1])
     axes.set_ylim(0, max(100 * float(changed.max(initial=0.0)) * 1.15, 10))
     axes.set_ylabel(f"changed\n≤ {NEAR_M:g} m, %" if named else "", color=INK, fontsize=8)
@@ -163,7 +160,7 @@ def _draw_errors(
     axes.set_ylim(*_range(reach, largest, enlarged=enlarged))
     if not enlarged:
         _write_errors(axes, series, quantity)
-    axes.axhline(0.0, color="#b9c1cc", linewidth=0.8, zorder=1)
+    axes.axhline(0.0, color=FAINT, linewidth=0.8, zorder=1)
     axes.set_ylabel(f"{name}, {unit}", color=INK)
     axes.tick_params(colors=INK, labelsize=9)
     spines(axes)
@@ -187,7 +184,7 @@ def _mark_changes(axes: Axes, share: tuple[F64, F64]) -> None:
     """Dotted lines where places begin and end that have changed much."""
     t_s, changed = share
     for index in np.flatnonzero(np.diff(changed > _MUCH)):
-        axes.axvline((t_s[index] + t_s[index + 1]) / 2, color=_PURPLE, linewidth=1.1, linestyle=":", zorder=2)
+        axes.axvline((t_s[index] + t_s[index + 1]) / 2, color=MAGENTA, linewidth=1.1, linestyle=":", zorder=2)
 
 
 def _write_errors(axes: Axes, series: Mapping[Curve, PoseSeries], quantity: int) -> None:

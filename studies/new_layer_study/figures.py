@@ -6,7 +6,8 @@ from typing import Any, Final
 
 from matplotlib.ticker import MaxNLocator
 
-from studies.frame.figures import BLUE, GREEN, GREY, MAGENTA, ORANGE, dress, finish, new_figure
+from gnd.picture_style import BLUE, GREEN, GREY, MAGENTA, ORANGE
+from studies.frame.figures import dress, finish, new_figure
 from studies.new_layer_study import layers as reference
 from studies.new_layer_study.layers import (
     DIRECTIONS,

@@ -7,7 +7,8 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from studies.frame.figures import BLUE, GREEN, GREY, INK, MAGENTA, ORANGE, dress, finish, new_figure
+from gnd.picture_style import BLUE, GREEN, GREY, INK, MAGENTA, ORANGE
+from studies.frame.figures import dress, finish, new_figure
 from studies.simulation import scores as reference
 
 PAPER_KB_PER_KM: Final = 56.32

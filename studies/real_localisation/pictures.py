@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,9 +11,10 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
+from gnd.picture_style import CYCLE, FAINT, GRID, INK, styled
 from gnd.vehicle_agent.localise import PoseEstimate
 from gnd.vehicle_agent.localise.georeference import Georeferenced
-from studies.frame.figures import INK, save
+from studies.frame.figures import save
 from studies.real.scene import RecordedScans
 from studies.real_localisation.flexmap import DrawnFlexmap
 from studies.real_localisation.halves import METHODS, Half, localised
@@ -22,10 +22,8 @@ from studies.real_localisation.odometry import OdometryResult
 
 F64 = NDArray[np.float64]
 
-COLOURS: Final = ("#1f5fbf", "#d9542b", "#2c8c4a", "#8d5bb5", "#b8860b")
-MAP: Final = "#b9c3d0"
 
-
+@styled
 def draw_halves(
     recorded: RecordedScans, tracks: Sequence[OdometryResult], halves: Sequence[Half], folder: Path
 ) -> list[Path]:
@@ -36,7 +34,7 @@ def draw_halves(
     _map_above(above, half)
     known = [(one.name, one.track) for one in tracks if one.track is not None]
     first = half.scene.poses.T_dst_vehicle[0]
-    for colour, (name, track) in zip(COLOURS, known, strict=False):
+    for colour, (name, track) in zip(CYCLE, known, strict=False):
         p = (first @ track.T_dst_vehicle)[:, :3, 3]
         above.plot(p[:, 0], p[:, 1], "-", color=colour, lw=1.3, label=name)
     for (method, parameters), marker in zip(METHODS.items(), ("o", "x"), strict=False):
@@ -44,7 +42,7 @@ def draw_halves(
         _errors_of(errors, estimates, half.scene.poses, method.replace("_", " "), marker)
         p = np.array([e.T_map_vehicle[:3, 3] for e in estimates]).reshape(-1, 3)
         above.plot(p[:, 0], p[:, 1], marker, color=INK, ms=4, mfc="none", label=f"localised {method.replace('_', ' ')}")
-    above.legend(loc="best", fontsize=8)
+    above.legend(loc="best")
     above.set_title(f"{recorded.name}: {half.name}")
     return [save(figure, folder / f"{recorded.name}_localised.png")]
 
@@ -66,13 +64,14 @@ def _errors_of(axes: Axes, estimates: Sequence[PoseEstimate], reference: Traject
     at_s = (np.array([e.t_ns for e in estimates]) - reference.t_ns[0]) * 1e-9
     heading = np.degrees(np.arctan2(off[:, 1, 0], off[:, 0, 0]))
     values = (100 * off[:, 0, 3], 100 * off[:, 1, 3], 10 * heading)
-    for colour, label, value in zip(COLOURS, ("along, cm", "across, cm", "heading, 0.1°"), values, strict=False):
+    for colour, label, value in zip(CYCLE, ("along, cm", "across, cm", "heading, 0.1°"), values, strict=False):
         axes.plot(at_s, value, f"-{marker}", color=colour, lw=0.8, ms=4, mfc="none", label=f"{label}, {name}")
     axes.set(xlabel="time s", title="against the LiDAR track")
     axes.axhline(0.0, color=INK, lw=0.5)
-    axes.legend(fontsize=8)
+    axes.legend()
 
 
+@styled
 def draw_flexmap(drawn: DrawnFlexmap, name: str, folder: Path) -> list[Path]:
     """Lanes, both tracks and the fixes, whole and from near."""
     figure = Figure(figsize=(16.0, 8.5), layout="constrained")
@@ -80,14 +79,14 @@ def draw_flexmap(drawn: DrawnFlexmap, name: str, folder: Path) -> list[Path]:
     fixes = drawn.fixes.enu_m(drawn.bent.frame)
     rigid = (drawn.bent.frame.T_self_other(drawn.rigid.frame) @ drawn.rigid.track.T_dst_vehicle)[:, :3, 3]
     for axes in (whole, near):
-        axes.add_collection(PolyCollection(list(drawn.lanes), facecolor="#dfe5ec", edgecolor=MAP, lw=0.5))
-        axes.plot(rigid[:, 0], rigid[:, 1], "-", color=COLOURS[1], lw=1.0, label="track, rigid")
-        axes.plot(*_xy(drawn.bent), "-", color=COLOURS[0], lw=1.2, label="track, bent")
-        for chosen, colour, label in ((~drawn.held_out, COLOURS[2], "used"), (drawn.held_out, INK, "held out")):
+        axes.add_collection(PolyCollection(list(drawn.lanes), facecolor=GRID, edgecolor=FAINT, lw=0.5))
+        axes.plot(rigid[:, 0], rigid[:, 1], "-", color=CYCLE[1], lw=1.0, label="track, rigid")
+        axes.plot(*_xy(drawn.bent), "-", color=CYCLE[0], lw=1.2, label="track, bent")
+        for chosen, colour, label in ((~drawn.held_out, CYCLE[2], "used"), (drawn.held_out, INK, "held out")):
             axes.plot(fixes[chosen, 0], fixes[chosen, 1], ".", color=colour, ms=2.0, label=f"GNSS, {label}")
         axes.set(aspect="equal", xlabel="east m", ylabel="north m")
     whole.set_title(f"{name}: SLAM track and lanes on the Earth")
-    whole.legend(loc="best", fontsize=8)
+    whole.legend(loc="best")
     corner = np.array(_xy(drawn.bent)).T[int(0.3 * len(drawn.bent.track))]
     near.set(xlim=(corner[0] - 45, corner[0] + 45), ylim=(corner[1] - 45, corner[1] + 45), title="from near")
     return [save(figure, folder / f"{name}_georeferenced.png")]

@@ -12,7 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from gnd.fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
 from gnd.fleet_sim.pictures import StreetView, draw_map
 from gnd.fleet_sim.truth import LEVELS, Truth, read_truth
-from studies.frame.figures import INK, PALE, dress, save
+from gnd.picture_style import BLUE, DPI, GREEN, INK, MAGENTA, NOTE_PT, ORANGE, PAPER, SMALL_PT, TITLE_PT
+from studies.frame.figures import PALE, dress, save
 from studies.simulation import scores as reference
 from studies.simulation.cloud import arrived, map_of_one, merged_map
 from studies.simulation.scores import SimulationOutcome, WorldOutcome, target_single
@@ -62,13 +63,13 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
 
     The axis is broken: the stale map lies far below everything else.
     """
-    figure = Figure(figsize=(9.4, 6.4), dpi=150, facecolor="white")
+    figure = Figure(figsize=(9.4, 6.4), dpi=DPI, facecolor=PAPER)
     axes, below = figure.add_axes((0.08, 0.27, 0.89, 0.61)), figure.add_axes((0.08, 0.095, 0.89, 0.13))
     numbers = sorted(int(n) for n in summary["fleet"])
     drawn = [*_curves(axes, summary, numbers), *_baseline(axes, summary)]
     stale = summary["stale"]["f1"]["observable"]
-    below.axhline(stale, color="#2f6fb5", linewidth=1.8)
-    axes.plot([], [], color="#2f6fb5", linewidth=1.8, label=f"stale map: {stale:.2f} (paper {reference.PAPER_STALE})")
+    below.axhline(stale, color=BLUE, linewidth=1.8)
+    axes.plot([], [], color=BLUE, linewidth=1.8, label=f"stale map: {stale:.2f} (paper {reference.PAPER_STALE})")
     paper = {1: reference.SINGLE, **reference.FLEET_READ_OFF, **reference.FLEET}
     shown = [n for n in paper if n <= max(numbers)]
     axes.plot(shown, [paper[n] for n in shown], "x", color=INK, markersize=7, label="paper", clip_on=False, zorder=5)
@@ -82,7 +83,7 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
     below.set_ylim(stale - 6, stale + 6)
     below.set_xlabel("vehicles", color=INK)
     axes.set_ylabel("macro F1 in percent", color=INK)
-    axes.legend(frameon=False, fontsize=9.5, loc="lower right", labelcolor=INK, ncols=2)
+    axes.legend(frameon=False, fontsize=SMALL_PT, loc="lower right", labelcolor=INK, ncols=2)
     seeds = ", ".join(map(str, summary["seeds"]))
     _title(figure, "F1 by number of vehicles", f"world seed {seeds}, poses {summary['parameters']['poses']}")
     return save(figure, path)
@@ -95,10 +96,10 @@ def _curves(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> list[
     for level in reversed(LEVELS):
         values = [summary["fleet"][str(n)]["f1"][level] for n in numbers]
         width, label = 2.4 if level == "observable" else 1.3, f"fleet, {_LEVEL_NAMES[level]}"
-        axes.plot(numbers, values, _LEVEL_STYLE[level], color="#2e8b57", linewidth=width, label=label)
+        axes.plot(numbers, values, _LEVEL_STYLE[level], color=GREEN, linewidth=width, label=label)
         drawn += values
     single, of = _one_drive(summary)
-    axes.axhline(single, color="#e0a020", linewidth=1.8, label=f"one drive, {of}: {single:.2f}")
+    axes.axhline(single, color=ORANGE, linewidth=1.8, label=f"one drive, {of}: {single:.2f}")
     return [*drawn, single]
 
 
@@ -115,7 +116,7 @@ def _spread(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> None:
     worlds = list(summary.get("by_seed", {}).values())
     if worlds:
         each = np.array([[world["fleet"][str(n)]["f1"]["observable"] for n in numbers] for world in worlds])
-        axes.fill_between(numbers, each.min(axis=0), each.max(axis=0), color="#2e8b57", alpha=0.15, linewidth=0)
+        axes.fill_between(numbers, each.min(axis=0), each.max(axis=0), color=GREEN, alpha=0.15, linewidth=0)
 
 
 def _baseline(axes: Axes, summary: Mapping[str, Any]) -> list[float]:
@@ -124,10 +125,10 @@ def _baseline(axes: Axes, summary: Mapping[str, Any]) -> list[float]:
     numbers = sorted(int(n) for n in fleet)
     values = [float(fleet[str(n)]["f1"]["observable"]) for n in numbers]
     if values:
-        axes.plot(numbers, values, "o-", color="#8455a8", linewidth=1.6, markersize=4, label="point clouds, observable")
+        axes.plot(numbers, values, "o-", color=MAGENTA, linewidth=1.6, markersize=4, label="point clouds, observable")
     return values
 
 
 def _title(figure: Figure, title: str, note: str) -> None:
-    figure.text(0.03, 0.955, title, fontsize=16, weight="bold", color=INK, va="center")
-    figure.text(0.03, 0.912, note, fontsize=10, color=PALE, va="center")
+    figure.text(0.03, 0.955, title, fontsize=TITLE_PT, weight="bold", color=INK, va="center")
+    figure.text(0.03, 0.912, note, fontsize=NOTE_PT, color=PALE, va="center")

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from gnd.gnd_map.arrays import F64, I64
-from studies.frame.figures import BLUE, GREY, INK, MAGENTA, ORANGE, RED, dress, finish, new_figure
+from gnd.picture_style import BLUE, GREY, INK, MAGENTA, ORANGE, RED
+from studies.frame.figures import dress, finish, new_figure
 from studies.slamcu_study import signs as reference
 from studies.slamcu_study.scores import SignScore, merged_score, scored_drive
 from studies.slamcu_study.signs import ABSENT, DELETED, EXIST, NEW, SignTruth, SlamcuSeed, Verdicts

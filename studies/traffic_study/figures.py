@@ -11,16 +11,32 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from gnd.gnd_map.arrays import F64
-from studies.frame.figures import INK, PALE, save, spines
+from gnd.picture_style import (
+    BLUE,
+    DPI,
+    GREEN,
+    GREY,
+    GRID,
+    INK,
+    MAGENTA,
+    NOTE_PT,
+    ORANGE,
+    PAPER,
+    SKY,
+    SMALL_PT,
+    TITLE_PT,
+    YELLOW,
+)
+from studies.frame.figures import PALE, save, spines
 
-_LINKS: Final = {"3g": "#2f6fb5", "4g": "#e08a1e", "5g": "#d9b310"}
+_LINKS: Final = {"3g": BLUE, "4g": ORANGE, "5g": YELLOW}
 """As in the paper: blue, orange, yellow."""
 _COLOURS: Final = {
-    "raw": "#58b0d8",
-    "pcd": "#8455a8",
-    "pcd_changes": "#8455a8",
-    "gnd_float": "#8a94a3",
-    "gnd": "#2e8b57",
+    "raw": SKY,
+    "pcd": MAGENTA,
+    "pcd_changes": MAGENTA,
+    "gnd_float": GREY,
+    "gnd": GREEN,
 }
 _GAP: Final = 0.042
 """Least distance of two notes, as a share of the axis."""
@@ -44,7 +60,7 @@ def draw_figures(found: Mapping[str, Any], folder: Path) -> list[Path]:
     """
     pictures = (("download.png", _download), ("upload_fleet.png", _fleet))
     for name, draw in pictures:
-        figure = Figure(figsize=(9.6, 5.6), dpi=130, facecolor="white", layout="constrained")
+        figure = Figure(figsize=(9.6, 5.6), dpi=DPI, facecolor=PAPER, layout="constrained")
         draw(figure.add_subplot(), found)
         save(figure, folder / name)
     return [folder / name for name, _ in pictures]
@@ -114,7 +130,13 @@ def _finish(axes: Axes, notes: Sequence[Note], title: str, note: str) -> None:
     heights = spread([(np.log10(one.size) - low) / (high - low) for one in notes], _GAP)
     for one, height in zip(notes, heights, strict=True):
         axes.annotate(
-            one.text, (1.012, height), xycoords="axes fraction", color=one.colour, va="center", fontsize=9, zorder=5
+            one.text,
+            (1.012, height),
+            xycoords="axes fraction",
+            color=one.colour,
+            va="center",
+            fontsize=SMALL_PT,
+            zorder=5,
         )
     _titled(axes, title, note)
 
@@ -128,9 +150,9 @@ def spread(heights: Sequence[float], gap: float) -> list[float]:
 
 
 def _titled(axes: Axes, title: str, note: str) -> None:
-    axes.set_title(f"{title}\n", loc="left", color=INK, fontsize=14, weight="bold")
-    axes.text(0.0, 1.025, note, transform=axes.transAxes, color=PALE, fontsize=9)
-    axes.grid(visible=True, color="#e6eaf0", linewidth=0.7)
+    axes.set_title(f"{title}\n", loc="left", color=INK, fontsize=TITLE_PT, weight="bold")
+    axes.text(0.0, 1.025, note, transform=axes.transAxes, color=PALE, fontsize=NOTE_PT)
+    axes.grid(visible=True, color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(colors=INK, labelsize=9)
     spines(axes)

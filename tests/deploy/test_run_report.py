@@ -18,17 +18,19 @@ from fleet_testing import Run
 from html_reader import Reader
 
 from gnd.deploy.errors import PageError, ReportError
+from gnd.deploy.live_traffic import size_text
 from gnd.deploy.report import printing
-from gnd.deploy.report.colours import SAFE_COLOURS
 from gnd.deploy.report.command import report
 from gnd.deploy.report.figures import health_shares
 from gnd.deploy.report.finished_run import read_finished_run
 from gnd.deploy.report.page import report_page
+from gnd.deploy.status.command import status
 from gnd.fleet_sim.dense_scan import ScanPlan
 from gnd.fleet_sim.errors import TruthError
 from gnd.fleet_sim.street import street
 from gnd.fleet_sim.truth import make_truth, write_truth
 from gnd.gnd_map.classes import ChangeClass
+from gnd.picture_style import SAFE_COLOURS
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("fleets"), pytest.mark.timeout(1200)]
 EVIL = "<img src=x onerror=alert(1)>&\"'"
@@ -87,6 +89,32 @@ def test_a_run_of_recorded_drives_is_told_without_truth(finished: Path) -> None:
     assert run.mark["software"]["eclipse-zenoh"] in words
     # two states of the map, three changes, errors of localisation
     assert len(pictures_of(text)) == 2 + 3 + 1
+
+
+def test_what_is_a_command_in_the_summary_looks_like_one(copy: Path) -> None:
+    waiting = json.loads((copy / "summary.json").read_text())
+    waiting["waiting_for_confirmation"] |= {"voxels": 1, "tiles": 1, "parked": 2}
+    (copy / "summary.json").write_text(json.dumps(waiting))
+    text = report_page(read_finished_run(copy), pictures=0)
+    said = text[text.index('<ul class="said">') :].partition("</ul>")[0]
+    assert "waiting for confirmation: 1 voxel in 1 tile: another" in said
+    assert "(<code>gnd map status</code>)" in said
+    assert "(<code>confirmation.parked_h</code>)" in said
+    assert "`" not in said
+
+
+def test_the_operators_room_shows_the_vehicles_of_a_finished_run(finished: Path) -> None:
+    by_vehicle = json.loads((finished / "summary.json").read_text())["traffic"]["by_vehicle"]
+    told = json.loads(CliRunner().invoke(status, [str(finished), "--json"], catch_exceptions=False).stdout)
+    driven = {one["vehicle"]: one["drive_km"] for one in told["vehicles"]}
+    assert driven == pytest.approx({name: own["drive_km"] for name, own in by_vehicle.items()}, abs=1e-3)
+    assert (told["parts_waiting"], told["alerts"]) == (0, []), "a run that has ended misses no shard"
+    screen = CliRunner().invoke(status, [str(finished)], catch_exceptions=False).stdout
+    for name, own in by_vehicle.items():
+        (line,) = (line for line in screen.splitlines() if line.startswith(name))
+        assert f"{size_text(own['down_wire_bytes'])}" in line
+        assert f"{size_text(own['up_wire_bytes'])}" in line
+    assert CliRunner().invoke(status, [str(finished), "--check"]).exit_code == 0
 
 
 def test_the_list_holds_the_changes_of_the_map(finished: Path) -> None:

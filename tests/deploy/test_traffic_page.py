@@ -49,7 +49,8 @@ def test_the_page_holds_the_figures_of_the_account(tmp_path):
     for word in (
         "tile",
         "change",
-        "acks",
+        "TCP acks",
+        "acknowledgement",
         "session",
         "3g",
         "690.47",

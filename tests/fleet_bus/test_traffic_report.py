@@ -64,7 +64,7 @@ def test_use_of_a_link_by_hand(run):
 def test_the_table_names_agents_kinds_and_links(run):
     result = CliRunner().invoke(traffic, [str(run)], catch_exceptions=False)
     assert result.exit_code == 0
-    for word in ("car-1", "car-2", "change", "ack", "3g", "4g", "5g", "2 agents, 4.00 km", "on the wire"):
+    for word in ("car-1", "car-2", "change", "acknowledgement", "3g", "4g", "5g", "2 agents, 4.00 km", "on the wire"):
         assert word in result.output
 
 

@@ -10,13 +10,14 @@ from gnd.fleet_sim.errors import SimError
 from gnd.fleet_sim.pictures import StreetView, draw_map, draw_run
 from gnd.fleet_sim.truth import Truth
 from gnd.fleet_sim.world import World
-from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
+from gnd.gnd_map.classes import ChangeClass
+from gnd.picture_style import SAFE_COLOURS
 
 
 def share_of_hue(path: Path, change_class: ChangeClass) -> float:
     """Share of pixels below the heading whose colour is a lit or shaded version of the class's."""
     pixels = imread(path)[200::2, ::2, :3].reshape(-1, 3)
-    wanted = np.array(to_rgb(CLASS_COLOURS[change_class])) - np.mean(to_rgb(CLASS_COLOURS[change_class]))
+    wanted = np.array(to_rgb(SAFE_COLOURS[change_class])) - np.mean(to_rgb(SAFE_COLOURS[change_class]))
     hue = pixels - pixels.mean(axis=1, keepdims=True)
     size = np.linalg.norm(hue, axis=1)
     close = hue @ wanted / np.maximum(size * np.linalg.norm(wanted), 1e-9) > 0.97

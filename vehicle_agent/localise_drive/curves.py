@@ -12,14 +12,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from gnd.gnd_map.arrays import F64, I64
+from gnd.picture_style import INK, MUTED
 from gnd.vehicle_agent.localise.estimates import ErrorSeries, PoseEstimate, error_series
 from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, AccuracyLimit, healthy
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
 from gnd.vehicle_agent.localise_drive.stretches import HEALTHS, HealthStretch, stretches_of
 from gnd.vehicle_agent.localise_drive.style import (
     HEALTH_COLOURS,
-    INK,
-    MUTED,
     ONLINE,
     REFINED,
     dress,

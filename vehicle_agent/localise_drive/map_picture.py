@@ -13,12 +13,13 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from gnd.gnd_map.arrays import F64
+from gnd.picture_style import DPI, FAINT, INK, MUTED
 from gnd.vehicle_agent.localise.estimates import error_series
 from gnd.vehicle_agent.localise_drive.curves import GAP_NS, draw_errors, draw_quality
 from gnd.vehicle_agent.localise_drive.map_raster import COLOURS, KINDS, MapRaster
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
 from gnd.vehicle_agent.localise_drive.stretches import HEALTHS
-from gnd.vehicle_agent.localise_drive.style import DPI, FAINT, HEALTH_COLOURS, INK, MUTED, new_figure, save_figure
+from gnd.vehicle_agent.localise_drive.style import HEALTH_COLOURS, new_figure, save_figure
 from gnd.vehicle_agent.tiles_at_hand import TileSource
 
 MARGIN_M: Final = 30.0

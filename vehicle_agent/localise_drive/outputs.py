@@ -29,7 +29,7 @@ from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise_drive.account import health_json
 from gnd.vehicle_agent.localise_drive.geo import csv_text, geojson_text
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
-from gnd.vehicle_agent.localise_drive.stretches import stretches_of
+from gnd.vehicle_agent.localise_drive.stretches import HealthStretch, stretches_of
 
 NAMES: Final = (
     "poses.tum", "online.tum", "reference.tum", "poses.kitti", "times.txt", "reference.kitti", "poses.mcap",
@@ -108,17 +108,17 @@ def _kitti(drive: LocalisedDrive, folder: Path) -> list[Path]:
     return written
 
 
+def _health_text(stretch: HealthStretch) -> str:
+    """Health with its cause, which may be good, too: a good pose on a stale map."""
+    return stretch.health if stretch.cause == "none" else f"{stretch.health} ({stretch.cause.replace('_', ' ')})"
+
+
 def _mcap(drive: LocalisedDrive, folder: Path) -> list[Path]:
     tracks = [_track("refined", drive.refined), _track("online", drive.online)]
     reference = reference_at(drive, [*drive.refined, *drive.online])
     if reference is not None:
         tracks.append(PoseTrack("reference", reference))
-    notes = [
-        HealthNote(
-            one.first_ns, LEVELS[one.health], one.health if one.cause == "none" else f"{one.health}: {one.cause}"
-        )
-        for one in stretches_of(drive.moments)
-    ]
+    notes = [HealthNote(one.first_ns, LEVELS[one.health], _health_text(one)) for one in stretches_of(drive.moments)]
     metadata = {"drive_id": drive.header.drive_id, "vehicle": drive.header.vehicle}
     path, moves = folder / "poses.mcap", drive.reference is None  # else /tf of the drive itself says where it was
     write_poses_mcap(path, drive.header.anchor, tracks, notes, metadata, moves_vehicle=moves)

@@ -6,17 +6,29 @@ from typing import Any, Final
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from gnd.picture_style import (
+    BLUE,
+    DPI,
+    FAINT,
+    GREEN,
+    GRID,
+    INK,
+    LABEL_PT,
+    MUTED,
+    NOTE_PT,
+    ORANGE,
+    PAPER,
+    RED,
+    SMALL_PT,
+    TITLE_PT,
+    write_png,
+)
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.localise_drive.stretches import HealthStretch
 
-INK: Final = "#1c2430"
-MUTED: Final = "#5a6675"
-FAINT: Final = "#c3ccd8"
-DPI: Final = 150
-HEALTH_COLOURS: Final = {"good": "#2e8b57", "degraded": "#e0a020", "lost": "#d1433f"}
-REFINED: Final = "#c8322d"
-ONLINE: Final = "#8a5a2b"
-"""Red and brown, as with and without submap in the paper's Figure 19."""
+HEALTH_COLOURS: Final = {"good": GREEN, "degraded": ORANGE, "lost": RED}
+REFINED: Final = RED
+ONLINE: Final = BLUE
 _WORDS: Final = 0.05
 """Shortest stretch, of the whole drive, that is named."""
 _STRIP: Final = 0.035
@@ -25,19 +37,19 @@ _STRIP: Final = 0.035
 
 def new_figure(width_in: float, height_in: float, title: str, note: str) -> Figure:
     """A figure with a heading and a small line below it, 0.9 inches in all."""
-    figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
     left = 0.4 / width_in
-    figure.text(left, 1.0 - 0.36 / height_in, title, fontsize=16, weight="bold", color=INK, va="center")
-    figure.text(left, 1.0 - 0.65 / height_in, note, fontsize=10, color=MUTED, va="center")
+    figure.text(left, 1.0 - 0.36 / height_in, title, fontsize=TITLE_PT, weight="bold", color=INK, va="center")
+    figure.text(left, 1.0 - 0.65 / height_in, note, fontsize=NOTE_PT, color=MUTED, va="center")
     return figure
 
 
 def dress(axes: Axes, label: str) -> None:
     """Grid, colours, the label of the y axis."""
-    axes.set_ylabel(label, color=INK)
-    axes.grid(color="#e3e7ed", linewidth=0.8)
+    axes.set_ylabel(label, color=INK, fontsize=LABEL_PT)
+    axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.tick_params(colors=INK, labelsize=9)
+    axes.tick_params(colors=INK, labelsize=SMALL_PT)
     for name, spine in axes.spines.items():
         spine.set(visible=name in ("left", "bottom"), color=FAINT)
 
@@ -71,11 +83,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         LocaliseError: it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.part")
     try:
-        with partial.open("wb") as file:
-            figure.savefig(file, format="png")
-        partial.replace(path)
+        write_png(figure, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise LocaliseError(f"{path}: cannot write the picture: {error.strerror or error}") from None

@@ -6,12 +6,11 @@ from typing import Final
 from matplotlib.axes import Axes
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.localise_drive.style import INK, MUTED, new_figure, save_figure
+from gnd.picture_style import INK, MUTED, PANEL_PT, RED, SMALL_PT
+from gnd.vehicle_agent.localise_drive.style import new_figure, save_figure
 from gnd.vehicle_agent.map_align.align import MapAlignment
 from gnd.vehicle_agent.map_align.cloud import GaussianCloud
 
-_A: Final = "#5a6675"
-_B: Final = "#d1433f"
 _SHOWN_M: Final = 80.0
 
 
@@ -31,10 +30,10 @@ def draw_alignment(a: GaussianCloud, b: GaussianCloud, found: MapAlignment, path
 
 
 def _panel(axes: Axes, title: str, a: GaussianCloud, b: GaussianCloud, middle_m: F64) -> None:
-    for cloud, colour in ((a, _A), (b, _B)):
+    for cloud, colour in ((a, MUTED), (b, RED)):
         at = cloud.mean_m[cloud.is_upright, :2] - middle_m[:2]
         axes.plot(*at.T, ".", color=colour, markersize=1.6, alpha=0.6, markeredgewidth=0)
     axes.set(xlim=(-_SHOWN_M, _SHOWN_M), ylim=(-_SHOWN_M, _SHOWN_M), aspect="equal")
-    axes.set_title(title, color=INK, fontsize=11)
-    axes.set_xlabel("m east of the middle of the overlap", color=MUTED, fontsize=9)
-    axes.tick_params(colors=MUTED, labelsize=8)
+    axes.set_title(title, color=INK, fontsize=PANEL_PT)
+    axes.set_xlabel("m east of the middle of the overlap", color=MUTED, fontsize=SMALL_PT)
+    axes.tick_params(colors=MUTED, labelsize=SMALL_PT)
