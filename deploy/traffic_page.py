@@ -17,8 +17,8 @@ vehicle's connection (TCP_INFO: stream and packet headers). Each of them is assi
 payload, key, envelope and packets; <b>TCP acks</b> are packets without data (<b>TCP acks of tiles</b> those that answer
 tiles, by the share of packets), <b>resent</b> is what was lost and sent again, <b>opening</b> and <b>closing</b> are
 those of connections, <b>keep-alives</b> what an idle session sends to stay open, and <b>session</b> is the rest:
-declarations, answers that arrived too late. A kind without messages of its own consists of shares of other messages: one answer may
-contain many tiles.</p>"""
+declarations, answers that arrived too late. A kind without messages of its own consists of shares of other messages:
+one answer may contain many tiles.</p>"""
 
 
 def page(run: str, agents: Sequence[AgentTraffic], links: Sequence[LinkProfile]) -> str:

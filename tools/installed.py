@@ -121,7 +121,7 @@ def served_page(environment: Environment) -> int:
                 raise InstallationError(f"gnd serve: {log.read_text(encoding='utf-8')}")
             time.sleep(0.1)
         address = found[0].rstrip("/")
-        return sum(len(_fetched(f"{address}/{name}")) for name in ("", "page.js", "page.css", "api/about"))
+        return sum(len(_fetched(f"{address}/{name}")) for name in ("", "page.js", "page.css", "api/map"))
     finally:
         server.terminate()
         server.wait(timeout=30)

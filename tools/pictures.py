@@ -101,10 +101,10 @@ RECIPES: Final = (
     ),
     Recipe(
         "poles",
-        ("python -m studies poles --sensors none --recordings DATA --pictures poles",),
+        ("python -m studies poles --sensors none --recordings DATA --pictures drawn",),
         {
-            "poles/kitti_raw_0060_38.png": "poles_kitti_junction.png",
-            "poles/radiate_fog_30.png": "poles_radiate_fog.png",
+            "drawn/kitti_raw_0060_38.png": "poles_kitti_junction.png",
+            "drawn/radiate_fog_30.png": "poles_radiate_fog.png",
         },
     ),
     Recipe(

@@ -15,7 +15,7 @@ from gnd.deploy.serve.work_list import WorkList
 from gnd.fleet_bus.errors import LedgerError
 from gnd.fleet_bus.ledger_file import read_run
 from gnd.fleet_bus.links import load_link
-from gnd.fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals
+from gnd.fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals, kind_text
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.status import WORDS, status_of
 
@@ -64,9 +64,10 @@ def traffic(run: RunFolder | None) -> dict[str, Any]:
         agents = tuple(agent_traffic(ledger, links) for ledger in read_run(run.root))
     except LedgerError as error:
         return {"problem": f"no account of traffic yet: {error}"}
+    lines = [asdict(line) | {"kind": kind_text(line.kind)} for line in fleet_lines(agents)]
     return {
         "problem": "",
-        "fleet": fleet_totals(agents) | {"lines": [asdict(line) for line in fleet_lines(agents)]},
+        "fleet": fleet_totals(agents) | {"lines": lines},
         "links": [_link(link.name, agents) for link in links],
         "vehicles": [_agent(agent) for agent in agents],
     }
