@@ -56,7 +56,7 @@ def missing(wanted: list[str], python: str, platforms: tuple[str, ...]) -> list[
         if found is None:
             raise click.ClickException(f"pip for Python {python} on {platforms[0]}: {told[-1500:]}")
         names.append(found[1])
-        left = [one for one in wanted if _NAME.match(one)[0].lower() != found[1].lower()]  # type: ignore[index]
+        left = [one for one in wanted if _name(one) != _name(found[1])]
         if not left or len(left) == len(wanted):  # the latter: it is needed by one of them
             return names
         wanted = left
@@ -78,17 +78,30 @@ def _resolve(wanted: list[str], python: str, platforms: tuple[str, ...]) -> str 
     return None if done.returncode == 0 else done.stderr
 
 
+def missing_by_extra(python: str, platforms: tuple[str, ...]) -> dict[str, list[str]]:
+    """What has no wheel, by extra: all extras are asked about at once, and one by one only where that does not tell."""
+    by_extra = requirements()
+    names = {extra: {_name(one) for one in wanted} for extra, wanted in by_extra.items()}
+    found = missing(sorted({one for wanted in by_extra.values() for one in wanted}), python, platforms)
+    if all(any(_name(one) in own for own in names.values()) for one in found):
+        return {extra: [one for one in found if _name(one) in names[extra]] for extra in by_extra}
+    return {extra: missing(wanted, python, platforms) for extra, wanted in by_extra.items()}
+
+
+def _name(requirement: str) -> str:
+    """Name of a requirement as the index spells it."""
+    found = _NAME.match(requirement)
+    return "" if found is None else found[0].lower().replace("_", "-")
+
+
 @click.command(help=__doc__)
 @click.option("--python", "pythons", multiple=True, default=PYTHONS, show_default=True)
 def main(pythons: tuple[str, ...]) -> None:
     """Print the table."""
-    by_extra = requirements()
+    told = {machine: {one: missing_by_extra(one, places) for one in pythons} for machine, places in MACHINES.items()}
     click.echo("| | " + " | ".join(MACHINES) + " |\n|---|" + "---|" * len(MACHINES))
     for extra in EXTRAS:
-        cells = []
-        for platforms in MACHINES.values():
-            found = {python: missing(by_extra[extra], python, platforms) for python in pythons}
-            cells.append(_cell(found))
+        cells = [_cell({python: found[extra] for python, found in told[machine].items()}) for machine in MACHINES]
         click.echo(f"| {'base' if extra == 'base' else f'`{extra}`'} | " + " | ".join(cells) + " |")
 
 

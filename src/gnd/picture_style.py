@@ -57,8 +57,8 @@ _STYLE: Final[dict[Any, Any]] = {
     "axes.labelsize": LABEL_PT, "axes.labelcolor": INK, "axes.edgecolor": FAINT, "axes.spines.top": False,
     "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": GRID, "grid.linewidth": 0.8,
     "xtick.color": INK, "ytick.color": INK, "xtick.labelsize": SMALL_PT, "ytick.labelsize": SMALL_PT,
-    "legend.framealpha": 0.85, "legend.edgecolor": "none", "legend.fontsize": SMALL_PT, "legend.labelcolor": INK, "figure.titlesize": TITLE_PT,
-    "figure.titleweight": "bold",
+    "legend.framealpha": 0.85, "legend.edgecolor": "none", "legend.fontsize": SMALL_PT, "legend.labelcolor": INK,
+    "figure.titlesize": TITLE_PT, "figure.titleweight": "bold",
 }  # fmt: skip
 
 P = ParamSpec("P")

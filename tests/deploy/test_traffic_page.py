@@ -50,7 +50,6 @@ def test_the_page_holds_the_figures_of_the_account(tmp_path):
         "tile",
         "change",
         "TCP acks",
-        "acknowledgement",
         "session",
         "3g",
         "690.47",
