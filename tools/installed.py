@@ -128,7 +128,7 @@ def served_page(environment: Environment) -> int:
 
 
 def _fetched(url: str) -> bytes:
-    with urllib.request.urlopen(url, timeout=30) as answer:
+    with urllib.request.urlopen(url, timeout=START_S) as answer:
         content: bytes = answer.read()
     return content
 

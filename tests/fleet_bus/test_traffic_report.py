@@ -115,7 +115,7 @@ def test_a_crash_while_writing_is_mentioned(run):
     file = run / "ledger" / "car-1.jsonl"
     file.write_bytes(file.read_bytes()[:-10])
     result = CliRunner().invoke(traffic, [str(run)], catch_exceptions=False)
-    assert "1 unfinished ledger lines left out" in result.output
+    assert "1 unfinished ledger line left out" in result.output
 
 
 def test_unknown_runs_and_links_are_errors(run, tmp_path):
