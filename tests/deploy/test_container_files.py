@@ -96,3 +96,5 @@ def test_the_image_holds_every_folder_and_no_root() -> None:
             assert f"COPY {folder.name} {folder.name}\n" in text
     assert re.search(r"^USER 10001", text, re.M)
     assert "--require-hashes" in text
+    assert "SETUPTOOLS_SCM_PRETEND_VERSION_FOR_GND_FLEET=${VERSION}" in text, "there is no git in the image"
+    assert "--build-arg VERSION=" in (DEPLOY.parent / "Makefile").read_text()

@@ -1,9 +1,12 @@
 """Lanes seen against lanes of the map: generalised ICP, what it says along which direction, and which lane is which."""
 
+import sys
+
 import numpy as np
 import pytest
 from plane_scene import Noise, Scene, drive, sensors
 
+from gnd.extras import MissingExtra
 from gnd.gnd_map.errors import ShapeError
 from gnd.vehicle_agent.errors import NewLayerError
 from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative
@@ -168,3 +171,10 @@ def test_bad_lanes_are_refused():
         LaneMap.of([np.zeros((4, 3))])
     with pytest.raises(ShapeError, match="not finite"):
         LaneMap.of([np.array([[0.0, np.nan], [5.0, 0.0]])])
+
+
+def test_without_its_extra_it_says_which(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    lane = np.stack([np.arange(0.0, 20.0, 0.1), np.zeros(200)], axis=1)
+    with pytest.raises(MissingExtra, match=r"small_gicp is not installed; .*pip install 'gnd-fleet\[lanes\]'"):
+        gicp(lane, lane, np.zeros(3), 1.0)
