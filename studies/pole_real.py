@@ -163,5 +163,6 @@ def _from_the_side(axes: Any, scan: RealScan, pole: Pole, number: int) -> None:
     axes.scatter(across[near], height[near], s=1.5, c=GREY, linewidths=0)
     axes.scatter(across[core], height[core], s=3.0, c=COLOURS[pole.kind], linewidths=0)
     axes.set(xlim=(-SIDE_M, SIDE_M), ylim=(-0.5, 8.0))
-    axes.set_title(f"{number}: {pole.kind}, {distance:.0f} m, Ø {pole.diameter_m:.2f} m", fontsize=8)
+    kind = pole.kind.replace("_", " ")
+    axes.set_title(f"{number}: {kind}, {distance:.0f} m, Ø {pole.diameter_m:.2f} m", fontsize=7.5, weight="normal")
     axes.tick_params(labelsize=6)
