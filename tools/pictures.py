@@ -87,7 +87,7 @@ RECIPES: Final = (
     Recipe(
         "tutorial",
         (
-            "gnd import auto DATA/kitti_raw_0027 -o drive.mcap",
+            "gnd import auto DATA/kitti_raw_0027 -o drive.mcap --scans 0:32",
             "gnd map build -o map.sqlite drive.mcap",
             "gnd fleet --drives drive.mcap --agents 2 --map map.sqlite --made-up 4 --no-page --out healed",
         ),
