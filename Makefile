@@ -98,9 +98,9 @@ kernels: setup   ## compile all kernels ahead of time, into this checkout: progr
 wheel: kernels   ## a wheel with these kernels, for this version of Python and this kind of machine: build/wheel
 	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
 
-$(TOOLS)/.ready: Makefile
+$(TOOLS)/.ready: Makefile tools/constraints.txt
 	$(PYTHON) -m venv $(TOOLS)
-	$(TOOLS)/bin/pip install --quiet --disable-pip-version-check build cffconvert cyclonedx-bom pip-audit pip-tools setuptools-scm twine
+	$(TOOLS)/bin/pip install --quiet --disable-pip-version-check -c tools/constraints.txt build cffconvert cyclonedx-bom pip-audit pip-tools setuptools-scm twine
 	@touch $@
 
 LOCK = $(TOOLS)/bin/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
