@@ -154,15 +154,16 @@ def _is_sound(voxel_id: I32, count: I32, cells: I32, mean_m: F32, cov_m2: F32) -
         return True
     if not (voxel_id[1:] > voxel_id[:-1]).all():
         return False
-    if not count.any():
-        return not (cells.any() or mean_m.any() or cov_m2.any())
-    return bool(
-        count.min() > 0
-        and cells.min() >= 0
-        and np.abs(mean_m).max() <= MAX_MEAN_M  # nor is NaN
-        and np.isfinite(cov_m2).all()
-        and min(cov_m2[:, 0].min(), cov_m2[:, 3].min(), cov_m2[:, 5].min()) >= 0
-    )
+    with np.errstate(invalid="ignore"):  # some NaN warn where they are looked at
+        if not count.any():
+            return not (cells.any() or mean_m.any() or cov_m2.any())
+        return bool(
+            count.min() > 0
+            and cells.min() >= 0
+            and np.abs(mean_m).max() <= MAX_MEAN_M  # nor is NaN
+            and np.isfinite(cov_m2).all()
+            and min(cov_m2[:, 0].min(), cov_m2[:, 3].min(), cov_m2[:, 5].min()) >= 0
+        )
 
 
 def concat(parts: Sequence[Gaussians]) -> Gaussians:

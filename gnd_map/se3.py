@@ -25,7 +25,7 @@ def R_from_quaternion_xyzw(q: npt.ArrayLike) -> F64:
         norm = math.sqrt(x * x + y * y + z * z + w * w)
         if 0.0 < norm < math.inf:
             return _R_of_one(x / norm, y / norm, z / norm, w / norm)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # some NaN warn where they are multiplied
         length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     if quaternion.shape[-1:] != (4,) or not ((length > 0.0) & (length < np.inf)).all():
         raise ShapeError(f"quaternions: expected (..., 4) of finite length > 0, got shape {quaternion.shape}")

@@ -72,7 +72,7 @@ def cloud_of(scan: Scan) -> PointCloud:
     layout = _own_layout(with_ring=scan.ring is not None)
     dtype = _dtype_of(layout, _stride_of(layout))
     packed = np.empty(len(scan), dtype)
-    _xyz_view(packed)[:] = scan.points_m
+    _xyz_view(packed.data, dtype)[:] = scan.points_m
     packed["t_offset"] = scan.t_offset_ns
     if scan.ring is not None:
         packed["ring"] = scan.ring
@@ -99,7 +99,7 @@ def scan_of(cloud: PointCloud) -> Scan:
     _check_cloud(cloud, dtype, len(data))
     packed = np.frombuffer(data, dtype)
     # Copied once into rows of their own: packed points are not aligned, and kernels want one layout.
-    points = np.ascontiguousarray(_xyz_view(packed))
+    points = np.ascontiguousarray(_xyz_view(data, dtype))
     finite = np.isfinite(points)
     if not finite.all():
         packed, points = packed[finite.all(axis=1)], points[finite.all(axis=1)]
@@ -111,10 +111,13 @@ def scan_of(cloud: PointCloud) -> Scan:
     )
 
 
-def _xyz_view(packed: npt.NDArray[np.void]) -> npt.NDArray[np.float32]:
-    """(N, 3) view of x, y, z, which lie side by side in every packed point."""
-    start = packed.dtype.fields["x"][1]  # type: ignore[index]
-    return np.ndarray((len(packed), 3), "<f4", packed.data, start, (packed.dtype.itemsize, 4))
+def _xyz_view(data: bytes | memoryview, dtype: np.dtype[np.void]) -> npt.NDArray[np.float32]:
+    """(N, 3) view of x, y, z, which lie side by side in every packed point. Of the bytes themselves: numpy would write
+    down the layout of an array in words, a letter for every byte that no field has.
+    """
+    start = dtype.fields["x"][1]  # type: ignore[index]
+    n = memoryview(data).nbytes // dtype.itemsize
+    return np.ndarray((n, 3), "<f4", data, start, (dtype.itemsize, 4))
 
 
 def _own_layout(*, with_ring: bool) -> _Layout:
@@ -149,7 +152,7 @@ def _check_cloud(cloud: PointCloud, dtype: np.dtype[np.void], size: int) -> None
     spans = sorted((field[1], field[1] + field[0].itemsize) for field in fields.values())
     if any(end > start for (_, end), (start, _) in pairwise(spans)):
         raise BadValue(f"point fields {', '.join(fields)} at bytes {[start for start, _ in spans]} overlap")
-    if size % dtype.itemsize:
+    if dtype.itemsize < 1 or size % dtype.itemsize:
         raise BadValue(f"{size} bytes of points are no multiple of the {dtype.itemsize} bytes of a point")
     check_length("point cloud", size // dtype.itemsize, limits.MAX_POINTS_OF_SCAN, "points")
     if cloud.pose != _NO_POSE and not np.allclose(_T_of(cloud.pose), np.eye(4)):
