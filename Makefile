@@ -65,6 +65,7 @@ dist: $(TOOLS)/.ready  ## build wheel and source archive into dist/, twice: the 
 	rm -rf dist
 	$(TOOLS)/bin/cffconvert --validate -i CITATION.cff
 	$(TOOLS)/bin/python -m tools.dist --twice
+	@rm -rf src/gnd_fleet.egg-info  # it would tell programs that run from src another version than what is installed
 
 installed:       ## install what lies in dist/ into fresh environments and run a small fleet: make installed PYTHONS="python3.11 python3.13"
 	$(TOOLS)/bin/python -m tools.installed $(foreach one,$(PYTHONS),--python $(one))

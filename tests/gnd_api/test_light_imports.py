@@ -19,9 +19,8 @@ MESSAGES = (
 def loaded_by(program: str) -> set[str]:
     """Top-level modules that a fresh interpreter has loaded after a program."""
     code = f"import sys\n{program}\nprint(sorted({{name.split('.')[0] for name in sys.modules}}))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd="/", env={"PYTHONPATH": str(ROOT / "src")}
-    )
+    env = {"PYTHONPATH": str(ROOT / "src"), "GND_KERNELS": "numba"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/", env=env)
     assert done.returncode == 0, done.stderr
     return set(ast.literal_eval(done.stdout.splitlines()[-1]))
 
