@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gate_scene import CORRIDOR, START_NS, WALLS, map_of, match_maps, scan, seen, shift
 
-from gnd.vehicle_agent.detect.trial import Trial
+from gnd.vehicle_agent.detect.trial import Trial, _standing
 from gnd.vehicle_agent.local_map import LocalMap
 
 SEGMENT = 5  # scans of 0.1 s
@@ -116,3 +116,22 @@ def test_movers_do_not_speak(yard: LocalMap, points: list[np.ndarray]) -> None:
         mixed.moving[len(still) :] = True
         counted += numbers(one.push(mixed))
     assert counted + numbers(one.flush()) == list(range(20))
+
+
+def test_what_has_stood_but_was_not_given_yet_is_taken_back_too(yard: LocalMap, points: list[np.ndarray]) -> None:
+    one = trial(yard)
+    counted = drive(one, points, [None] * (2 * SEGMENT + 2))
+    assert 0 < len(counted) < SEGMENT, "the first segment has stood, and is given scan by scan"
+    one.take_back(START_NS + (2 * SEGMENT + 1) * 100_000_000)
+    assert numbers(one.flush()) == []
+    assert one.counts["scans_taken_back"] == 2 * SEGMENT + 2 - len(counted)
+    assert one.oldest is None
+
+
+@pytest.mark.parametrize("every", [1, 2, 3])
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_points_that_stand_are_those_that_numpy_picks(every: int, share: float) -> None:
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(101, 3)).astype(np.float32)
+    moving, off = rng.random(101) < share, np.array([1.0, -2.0, 0.5], np.float32)
+    np.testing.assert_array_equal(_standing(points, moving, every, off), points[~moving][::every] + off)

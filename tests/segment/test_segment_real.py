@@ -4,17 +4,14 @@ The places were found by looking at pictures of the scans from above: x along th
 frame of the first scan. The vehicle rolls up behind a standing car; another car and a long lorry follow.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gnd.gnd_map.se3 import transform
-from gnd.vehicle_agent.importer import map_track, open_recording
-from gnd.vehicle_agent.importers.recording import Recording
-from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.importer import open_recording
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
+from studies.moving_objects import refined_scans, segmented
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -30,28 +27,12 @@ FOLLOWING_CAR, LORRY = (-10.0, -4.5, -1.2, 1.2), (-21.5, -3.8, -5.5, -2.4)
 """Where they are in scan 23."""
 
 
-def refined_scans(recording: Recording) -> list[RefinedScan]:
-    """Scans with the poses of LiDAR odometry; KITTI's are free of the motion of the sweep."""
-    track = map_track(recording)
-    found = []
-    for n, t_ns in enumerate(track.t_ns.tolist()):
-        T_map_vehicle = track.at(t_ns)
-        T = T_map_vehicle @ recording.T_vehicle_lidar
-        points = recording.read(n).points_m.astype(np.float64)
-        points = transform(T, points[np.isfinite(points).all(axis=1)])
-        estimate = PoseEstimate(t_ns, T_map_vehicle, 0.02, 0.001, 0.9, "good")
-        found.append(RefinedScan(t_ns, points, np.tile(T[:3, 3], (len(points), 1)), estimate))
-    return found
-
-
 @pytest.fixture(scope="module")
 def junction(shared_data: Path) -> list[SegmentedScan]:
     folder = shared_data / "kitti_raw_0060"
     if not folder.is_dir():
         pytest.skip(f"no recording {folder.name}")
-    whole = open_recording("kitti", folder)
-    scans, segmenter = refined_scans(replace(whole, t_ns=whole.t_ns[:38])), MotionSegmenter()
-    return [done for scan in scans for done in segmenter.push(scan)]
+    return segmented(folder)
 
 
 def within(found: SegmentedScan, box: tuple[float, float, float, float]) -> np.ndarray:

@@ -10,6 +10,7 @@ from vehicle_scene import GRID_FRAME, SENSOR, ground, look, tiles_of, wall
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport
+from gnd.schemas.doubt import DoubtReason
 from gnd.schemas.keys import change_key
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
@@ -141,6 +142,24 @@ def test_tiles_left_at_once_are_decided_scan_by_scan_and_later_while_the_vehicle
     assert not steps[::2].any()  # those in which it was busy
     assert (steps > 0).sum() == len(tiles)
     assert sorted(c.tile for r in reports(outbox) for c in r.tiles) == sorted(tiles)
+
+
+@pytest.mark.parametrize("at_once", [1, 10**9])
+def test_what_is_doubtful_about_a_tile_is_told_however_long_it_waits_to_be_decided(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray, monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
+    monkeypatch.setattr(reporting, "VOXELS_AT_ONCE", at_once)
+    drive, seen = reporter(tiles, outbox, **PATIENT), scan(hits)
+    seen = replace(seen, scan=replace(seen.scan, estimate=replace(seen.scan.estimate, disagrees=True)))
+    drive.add_scan(seen)
+    for _ in range(len(tiles) + 1):
+        drive.leave_behind(estimate(x_m=200.0), 200.0)
+    changed = [c for r in reports(outbox) for c in r.tiles if len(c.changed)]
+    assert changed
+    assert changed[0].tile > min(tiles), "it is not decided first"
+    for change in changed:
+        assert change.doubt is not None
+        assert DoubtReason.ESTIMATES_DISAGREE in change.doubt.reasons
 
 
 def changed_in(found: list[ChangeReport]) -> int:

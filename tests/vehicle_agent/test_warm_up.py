@@ -16,7 +16,7 @@ PROGRAM = textwrap.dedent(
     from gnd.vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
     from gnd.vehicle_agent.features.poles import kernels as poles, place_kernels as places
     from gnd.gnd_map.codec import kernels as coders, voxel_kernels
-    INNER = {"cholesky", "newton_step", "principal", "by_levers", "descend", "without_hints"}  # parts of other kernels
+    INNER = {"cholesky", "newton_step", "principal", "by_levers", "descend", "rotation_of", "without_hints"}
     USED = (coders.code_bit, coders.code_bits, coders.code_flags, coders.code_plain, voxel_kernels.code_voxels)
     before = len(kernel.cast_rays.signatures)
     warm_up()

@@ -27,6 +27,7 @@ from gnd.vehicle_agent.localise.parameters import SamplingParameters
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from gnd.vehicle_agent.packed_rays import PackedRays
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
+from gnd.vehicle_agent.waiting import next_few
 
 Verdict = Literal["good", "shifted", "unchecked"]
 
@@ -36,8 +37,6 @@ _POINTS_OF_SEGMENT: Final = 3000
 _LEAST_POINTS_OF_SCAN: Final = 300
 POINTS_OF_POOR_SCAN: Final = 300
 _MAX_RANGE_M: Final = 50.0
-_SPREAD: Final = 8
-"""Of the scans that are evidence and wait to be given, one and this part are given a scan."""
 _EVERY_RECENT: Final = 2
 """So many of the last good segment's points are enough to compare with."""
 
@@ -141,8 +140,8 @@ class Trial:
         if self._open is None:
             self._open = _Segment(t_ns)
         self._open.scans.append(_TrialScan.of(segmented))
-        for _ in range(1 + len(self._stood) // _SPREAD if self._stood else 0):
-            yield self._stood.popleft().restore()
+        for stood in next_few(self._stood):
+            yield stood.restore()
 
     def flush(self) -> Iterator[SegmentedScan]:
         """The drive has ended: give what has stood the test until now."""

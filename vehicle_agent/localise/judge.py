@@ -87,6 +87,7 @@ class Judge:
 
     def see(self, scan: Matched, match_map: MatchMap) -> None:
         """Take a scan: evidence of its rays, how well it fits, whether another pose fits better."""
+        self.uniqueness.tested = False  # a scan that is too poor to compare does not reach it
         if scan.motion_gap_s > _MOTION_GAP_S or self.monitor.gap_s(scan.t_ns) > _GAP_S:
             self.monitor.distrust()
             self.uniqueness.distrust(moved=scan.motion_gap_s > _MOTION_GAP_S)

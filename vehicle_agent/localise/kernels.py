@@ -350,18 +350,28 @@ def newton_step(H: F64, g: F64, least: float, step: F64) -> None:
         step[r] /= LEVER_M
 
 
-@bare
-def _turned(step: F64, R: F64) -> None:
-    """R (3, 3) becomes exp(step[:3]) R."""
-    x, y, z = step[0], step[1], step[2]
+@bare_inlined
+def rotation_of(x: float, y: float, z: float) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Entries, row by row, of the rotation about the vector x, y, z by its length in radians."""
     angle = np.sqrt(x * x + y * y + z * z)
     half_sine = np.sin(0.5 * angle) / angle if angle > 1e-8 else 0.5
     x, y, z, w = half_sine * x, half_sine * y, half_sine * z, np.cos(0.5 * angle)
+    return (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w),
+        2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w),
+        2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@bare
+def _turned(step: F64, R: F64) -> None:
+    """R (3, 3) becomes exp(step[:3]) R."""
+    e00, e01, e02, e10, e11, e12, e20, e21, e22 = rotation_of(step[0], step[1], step[2])
     for c in range(3):
         a, b, d = R[0, c], R[1, c], R[2, c]
-        R[0, c] = (1.0 - 2.0 * (y * y + z * z)) * a + 2.0 * (x * y - z * w) * b + 2.0 * (x * z + y * w) * d
-        R[1, c] = 2.0 * (x * y + z * w) * a + (1.0 - 2.0 * (x * x + z * z)) * b + 2.0 * (y * z - x * w) * d
-        R[2, c] = 2.0 * (x * z - y * w) * a + 2.0 * (y * z + x * w) * b + (1.0 - 2.0 * (x * x + y * y)) * d
+        R[0, c] = e00 * a + e01 * b + e02 * d
+        R[1, c] = e10 * a + e11 * b + e12 * d
+        R[2, c] = e20 * a + e21 * b + e22 * d
 
 
 @kernel

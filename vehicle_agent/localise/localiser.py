@@ -25,14 +25,13 @@ from gnd.vehicle_agent.localise.remount import TRUSTED, Mounting
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from gnd.vehicle_agent.localise.sweep import Distortion, SampledScan, end_ns, reference_ns
 from gnd.vehicle_agent.localise.tracked_pose import MAX_GNSS_AGE_NS, DriveState, FinalScan, TrackedPose
+from gnd.vehicle_agent.waiting import next_few
 
 _LOST_GAP_S: Final = 15.0
 """After so long without scans it is lost."""
 _OUTSIDE_M: Final = 0.1
 _OUTSIDE_RAD: Final = 0.01
 """One sigma of a pose from outside."""
-_SPREAD: Final = 8
-"""Of the scans that wait with a final pose, one and this part are given a scan."""
 _PAST_NS: Final = 1_000_000_000
 _MOST_FROM_PAST: Final = 5
 """So many scans in a row that are older than the newest by more: the clock was wrong before."""
@@ -142,7 +141,7 @@ class Localiser:
         if track is not None:
             self._ready.extend(track.flush())
         while self._ready:
-            yield self._placed()
+            yield self._drive.output.final(*self._ready.popleft())
 
     @property
     def state(self) -> tuple[Health, Cause]:
@@ -338,9 +337,5 @@ class Localiser:
         """Some of the scans whose poses are final: several become so at once, and who works them off must not be late
         for the next scan.
         """
-        for _ in range(1 + len(self._ready) // _SPREAD if self._ready else 0):
-            yield self._placed()
-
-    def _placed(self) -> RefinedScan:
-        """The oldest scan whose pose is final."""
-        return self._drive.output.final(*self._ready.popleft())
+        for ready in next_few(self._ready):
+            yield self._drive.output.final(*ready)

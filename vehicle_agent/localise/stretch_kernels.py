@@ -8,6 +8,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.jit import bare, kernel
+from gnd.vehicle_agent.localise.kernels import rotation_of
 from gnd.vehicle_agent.localise.register_kernels import linearise_pose
 
 SHARED = 4
@@ -257,25 +258,18 @@ def normal_equations(
     add_steps(first, information, e, J, robust, A, g)
 
 
-@kernel
+@bare
 def move(T: F64, step: F64) -> None:
     """Move poses T (N, 4, 4) by -step (6 N + `SHARED`,): small motions of each vehicle in its own frame."""
-    R, E = np.empty((3, 3)), np.empty((3, 3))
     for k in range(T.shape[0]):
-        x, y, z = -step[6 * k], -step[6 * k + 1], -step[6 * k + 2]
-        angle = np.sqrt(x * x + y * y + z * z)
-        half_sine = np.sin(0.5 * angle) / angle if angle > 1e-8 else 0.5
-        x, y, z, w = half_sine * x, half_sine * y, half_sine * z, np.cos(0.5 * angle)
-        E[0, 0], E[0, 1], E[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
-        E[1, 0], E[1, 1], E[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
-        E[2, 0], E[2, 1], E[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
+        at = 6 * k
+        e00, e01, e02, e10, e11, e12, e20, e21, e22 = rotation_of(-step[at], -step[at + 1], -step[at + 2])
         for r in range(3):
-            for c in range(3):
-                R[r, c] = T[k, r, c]
-        for r in range(3):
-            T[k, r, 3] -= R[r, 0] * step[6 * k + 3] + R[r, 1] * step[6 * k + 4] + R[r, 2] * step[6 * k + 5]
-            for c in range(3):
-                T[k, r, c] = R[r, 0] * E[0, c] + R[r, 1] * E[1, c] + R[r, 2] * E[2, c]
+            a, b, d = T[k, r, 0], T[k, r, 1], T[k, r, 2]
+            T[k, r, 3] -= a * step[at + 3] + b * step[at + 4] + d * step[at + 5]
+            T[k, r, 0] = a * e00 + b * e10 + d * e20
+            T[k, r, 1] = a * e01 + b * e11 + d * e21
+            T[k, r, 2] = a * e02 + b * e12 + d * e22
 
 
 @kernel

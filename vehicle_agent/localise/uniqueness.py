@@ -172,7 +172,7 @@ class Uniqueness:
         self.margin = 0.0
         """Sigmas by which the tracked pose was ahead of the best other one at the last test."""
         self.tested = False
-        """Whether the newest scan was."""
+        """Whether a scan was since this was set to False."""
         self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
         self._beaten = self._ahead = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
@@ -205,7 +205,6 @@ class Uniqueness:
             match_map: the map window.
             believed: whether the scan's match is; what is not matched is not compared.
         """
-        self.tested = False
         if not self._par.enabled:
             return
         self._view.push(standing_m, T_before_now, T_tracked)

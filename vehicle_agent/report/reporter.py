@@ -300,10 +300,11 @@ class Reporter:
         left = left_behind(frame, open_tiles, p_map, self._left_behind_m)
         now = self._few_of(left)
         if len(now) < len(left):
-            left, self._looked_at = now, None  # the rest with the next scans
-        self._decide(left, odometer_m)
-        self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._left_behind_m))
-        self._open_districts = {t.district for t in open_tiles - set(left)}
+            self._looked_at = None  # the rest with the next scans
+        self._decide(now, odometer_m)
+        gone = left_behind(frame, self._doubts.all_tiles(), p_map, self._left_behind_m)
+        self._doubts.forget(set(gone) - open_tiles)  # what is known of those that wait counts when they are decided
+        self._open_districts = {t.district for t in open_tiles - set(now)}
 
     def _few_of(self, left: Collection[TileId]) -> tuple[TileId, ...]:
         """The first of the tiles that were left: one, or more of small ones; many at once would make a vehicle late."""
