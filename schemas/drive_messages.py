@@ -140,6 +140,9 @@ def _dtype_of(layout: _Layout, stride: int) -> np.dtype[np.void]:
     names, offsets, kinds = zip(*layout, strict=True) if layout else ((), (), ())
     with refusing(f"points of {stride} bytes with fields {', '.join(names) or 'none'}"):
         formats = [_NUMERIC[kind] for kind in kinds]
+        for name, offset, form in zip(names, offsets, formats, strict=True):
+            if offset + np.dtype(form).itemsize > stride:  # beyond 2 GiB numpy takes it, and reads outside the points
+                raise BadValue(f"point field {name!r} at byte {offset} lies outside points of {stride} bytes")
         return np.dtype({"names": list(names), "offsets": list(offsets), "formats": formats, "itemsize": stride})
 
 
