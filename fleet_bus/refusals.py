@@ -1,25 +1,25 @@
 """What this process has refused, by kind and reason: shown with its metrics."""
 
 import logging
+import threading
 import time
-from collections.abc import Callable
-from typing import Final
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Final
 
-from prometheus_client import CollectorRegistry, Counter
+if TYPE_CHECKING:  # a vehicle shows no metrics: what makes them is not loaded for it
+    from prometheus_client import CollectorRegistry
+    from prometheus_client.metrics_core import CounterMetricFamily
 
 TOLD_EVERY_S: Final = 60.0
-_REGISTRY: Final = CollectorRegistry()
-REFUSALS: Final = Counter(
-    "gnd_refusals",
-    "Requests, messages and connections that were not served, by kind and reason.",
-    ["kind", "reason"],
-    registry=_REGISTRY,
-)
+_COUNTS: Final[Counter[tuple[str, str]]] = Counter()
+_LOCK: Final = threading.Lock()
 
 
 def counted(kind: str, reason: str, n: int = 1) -> None:
     """Count refusals; kind and reason are words of the program, never of a message."""
-    REFUSALS.labels(kind, reason).inc(n)
+    with _LOCK:
+        _COUNTS[kind, reason] += n
 
 
 class RefusalsTold:
@@ -47,16 +47,29 @@ class RefusalsTold:
             self._log.warning("refused: %s", ", ".join(f"{n} {kind} ({why})" for (kind, why), n in sorted(new.items())))
 
 
-def show_refusals(registry: CollectorRegistry) -> None:
-    """Show them among the metrics of a registry."""
-    registry.register(REFUSALS)
-
-
 def refusals() -> dict[tuple[str, str], int]:
     """How many there were until now, by (kind, reason)."""
-    found = {}
-    for metric in REFUSALS.collect():
-        for sample in metric.samples:
-            if sample.name.endswith("_total"):
-                found[sample.labels["kind"], sample.labels["reason"]] = int(sample.value)
-    return found
+    with _LOCK:
+        return dict(_COUNTS)
+
+
+class _Shown:
+    """Collector of the refusals, as prometheus_client asks one."""
+
+    def collect(self) -> "Iterator[CounterMetricFamily]":
+        """The counter with a sample for each kind and reason."""
+        from prometheus_client.metrics_core import CounterMetricFamily
+
+        shown = CounterMetricFamily(
+            "gnd_refusals",
+            "Requests, messages and connections that were not served, by kind and reason.",
+            labels=["kind", "reason"],
+        )
+        for at, n in refusals().items():
+            shown.add_metric(at, n)
+        yield shown
+
+
+def show_refusals(registry: "CollectorRegistry") -> None:
+    """Show them among the metrics of a registry."""
+    registry.register(_Shown())

@@ -17,6 +17,7 @@ from gnd.picture_style import BLUE, GREY, RED
 from gnd.vehicle_agent.importer import map_track, open_recording
 from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
 from studies.frame.figures import dress, finish, new_figure
 
@@ -38,7 +39,7 @@ def refined_scans(recording: Recording) -> list[RefinedScan]:
         points = recording.read(n).points_m.astype(np.float64)
         points = transform(T, points[np.isfinite(points).all(axis=1)])
         estimate = PoseEstimate(t_ns, T_map_vehicle, 0.02, 0.001, 0.9, "good")
-        found.append(RefinedScan(t_ns, points, np.tile(T[:3, 3], (len(points), 1)), estimate))
+        found.append(RefinedScan(t_ns, PlacedRays(points, np.tile(T[:3, 3], (len(points), 1))), estimate))
     return found
 
 

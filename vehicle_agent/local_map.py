@@ -6,6 +6,7 @@ because a ray or a point looks up one address: a typed dict was measured 12 to 1
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,7 @@ class LocalMap:
         self._held: dict[TileId, HeldTile] = {}
         self._floors: tuple[int, int] | None = None
         self._built = -1
+        self._derived: dict[object, Any] = {}
         self._clear()
 
     def set_tile(self, tile: Tile) -> None:
@@ -127,6 +129,14 @@ class LocalMap:
         self._build()
         return len(self._mean)
 
+    @property
+    def derived(self) -> dict[object, Any]:
+        """What others have made of the map as it is now, by key of their own; forgotten when it changes, so that nobody
+        keeps a window of before.
+        """
+        self._build()
+        return self._derived
+
     def box_of(self, tile_id: TileId, origin_g: NDArray[np.int64] | None = None) -> tuple[slice, slice]:
         """The tile's columns along x and y in a window at `origin_g` (3,), by default in `index`."""
         origin = self.window_origin_g if origin_g is None else origin_g
@@ -148,11 +158,13 @@ class LocalMap:
         if self._built == self.generation:
             return
         self._built = self.generation
+        self._derived.clear()
         if not self._held:
             self._clear()
             return
         held = [self._held[t] for t in self.tiles]
         self._origin_g, shape = self._extent(held)
+        self._index = np.empty((0, 0, 0), np.int32)  # two windows are never held at once
         self._index = np.full(shape, UNKNOWN, np.int32)
         self._mean = np.concatenate([h.mean_map_m for h in held])
         self._cov = np.concatenate([h.cov_m2 for h in held])

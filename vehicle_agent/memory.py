@@ -16,8 +16,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import psutil
-
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # malloc.h
 _MADV_DONTNEED = 4  # mman.h
 MMAP_BYTES = 4 * 1024 * 1024
@@ -106,6 +104,8 @@ class MemoryMeter:
         """Proportional (PSS), resident (RSS) and private (USS) memory of this process now, the highest RSS so far, and
         the PSS then if as much was shared as now; MB.
         """
+        import psutil  # once, at the end of a drive: 1.4 MB
+
         info = psutil.Process(os.getpid()).memory_full_info()
         now = {name: round(getattr(info, name, 0) / 1e6, 1) for name in ("pss", "rss", "uss")}
         self.peak_rss_mb = max(self.peak_rss_mb, now["rss"])
@@ -121,4 +121,6 @@ def resident_mb() -> float:
         with open("/proc/self/statm", "rb", buffering=0) as statm:  # noqa: PTH123 - a hundredth of the time of a Path
             return int(statm.read().split()[1]) * _PAGE_BYTES / 1e6
     except OSError:
+        import psutil
+
         return float(psutil.Process(os.getpid()).memory_info().rss) / 1e6

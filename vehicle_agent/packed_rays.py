@@ -1,7 +1,9 @@
-"""The rays of a scan that waits, in a quarter to a third of their memory: points to 10 µm, starts to 0.1 mm."""
+"""The rays of a scan: as they were placed, or, while it waits, in a quarter to a third of their memory, points to 10 µm
+and starts to 0.1 mm.
+"""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,21 @@ F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
 _LEVELS: Final = 32767
 _LEAST_STEP_M: Final = 1e-4
+
+
+class PlacedRays(NamedTuple):
+    """N rays in the map frame: `ends_m` and `starts_m`, (N, 3) float64 each, in firing order."""
+
+    ends_m: F64
+    starts_m: F64
+
+    def restore(self) -> tuple[F64, F64]:
+        """Ends and starts."""
+        return self.ends_m, self.starts_m
+
+    def packed(self) -> "PackedRays":
+        """For waiting."""
+        return PackedRays.of(self.ends_m, self.starts_m)[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +53,15 @@ class PackedRays:
     def restore(self) -> tuple[F64, F64]:
         """Ends and starts (N, 3), float64, map frame."""
         return _restored(self.points_m, self.starts, self.until, self.step_m, self.centre_m)
+
+    def packed(self) -> "PackedRays":
+        """Themselves."""
+        return self
+
+    def starts_from_centre(self) -> F32:
+        """(N, 3) float32, metres."""
+        step_m = np.float32(self.step_m)
+        return np.repeat(self.starts.astype(np.float32) * step_m, np.diff(self.until, prepend=0), axis=0)
 
     @classmethod
     def of(cls, points_m: F64, starts_m: F64) -> tuple["PackedRays", F32]:

@@ -2,11 +2,11 @@
 
 from collections.abc import Collection, Iterable
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.gnd_map.track import Track
 from gnd.gnd_map.track_builder import TrackBuilder
-from gnd.vehicle_agent.localise.estimates import RefinedScan
 
 
 class Tracks:
@@ -25,10 +25,10 @@ class Tracks:
     def __len__(self) -> int:
         return len(self._builder)
 
-    def add_scan(self, scan: RefinedScan) -> None:
-        """Take a scan whose rays were counted."""
-        self._last_ns = max(self._last_ns, scan.t_ns)
-        self._builder.add_scan(scan.t_ns, scan.points_map_m, scan.origins_map_m, scan.estimate.T_map_vehicle)
+    def add_scan(self, t_ns: int, ends_map_m: F64, starts_map_m: F64, T_map_vehicle: F64) -> None:
+        """Take a scan whose rays (N, 3) were counted, map frame, from a pose (4, 4)."""
+        self._last_ns = max(self._last_ns, t_ns)
+        self._builder.add_scan(t_ns, ends_map_m, starts_map_m, T_map_vehicle)
 
     def touched(self, tiles: Iterable[TileId]) -> None:
         """All tiles about which there is evidence now; those not known here were touched since the last call."""

@@ -37,6 +37,7 @@ from gnd.vehicle_agent.localise.stretch import (
     marginalised,
     solve_stretch,
 )
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.report.packing import pack, pack_measured
 from gnd.vehicle_agent.report.reporter import on_lattice
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
@@ -86,7 +87,7 @@ def _try(local_map: LocalMap, scans: list[RefinedScan]) -> None:
     """Ask whether a shift explains what the scans see."""
     trial = Trial(MatchMapCache(local_map, RegistrationParameters().noise_m))
     for scan in scans:
-        for _ in trial.push(SegmentedScan(scan, np.zeros(len(scan.points_map_m), np.bool_))):
+        for _ in trial.push(SegmentedScan(scan, np.zeros(len(scan), np.bool_))):
             pass
     for _ in trial.flush():
         pass
@@ -135,7 +136,7 @@ def _segment(points_map_m: F64, estimate: PoseEstimate | None) -> None:
         t_ns = number * _SEGMENT_STEP_NS
         seen = np.concatenate([points_map_m, side + np.array([2.0 * number - 9.0, 0.0, 0.0])])
         pose = PoseEstimate(t_ns, np.eye(4) if estimate is None else estimate.T_map_vehicle, 0.01, 0.001, 1.0, "good")
-        segmenter.push(RefinedScan(t_ns, seen, np.broadcast_to(sensor, seen.shape).copy(), pose))
+        segmenter.push(RefinedScan(t_ns, PlacedRays(seen, np.broadcast_to(sensor, seen.shape).copy()), pose))
     for _ in segmenter.flush():
         pass
 

@@ -18,6 +18,7 @@ from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.lidar_odometry import Progress, reference_ns
 from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from studies.frame.errors import RealDataError
 from studies.frame.scans import rays
 
@@ -66,7 +67,7 @@ class RecordedScene:
         """A scan at its reference pose, as a localiser without error would give it."""
         t_ns = reference_ns(scan)
         estimate = PoseEstimate(t_ns, self.poses.at(t_ns), 0.0, 0.0, 1.0, "good")
-        return RefinedScan(t_ns, *rays(scan, self.poses, self.T_vehicle_lidar, t_ns), estimate)
+        return RefinedScan(t_ns, PlacedRays(*rays(scan, self.poses, self.T_vehicle_lidar, t_ns)), estimate)
 
     def accumulated(self, scans: Sequence[RefinedScan] | Iterator[RefinedScan]) -> VoxelAccumulator:
         """The points of scans as a map build takes them."""

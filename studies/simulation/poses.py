@@ -13,6 +13,7 @@ from gnd.gnd_map.se3 import exp_so3, transform
 from gnd.schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from studies.simulation.options import PoseSource
 
 TIME_CONSTANT_S: Final = 2.0
@@ -84,7 +85,7 @@ class FromReference:
             for points in (scan.points_m[finite], np.zeros((len(finite), 3), np.float32))
         )
         self.online = PoseEstimate(t_ns, T, self._source.sigma_m, self._source.sigma_rad, 1.0, "good")
-        return RefinedScan(t_ns, transform(T, ends), transform(T, starts), self.online)
+        return RefinedScan(t_ns, PlacedRays(transform(T, ends), transform(T, starts)), self.online)
 
 
 def _end_ns(scan: Scan) -> int:

@@ -64,9 +64,10 @@ static inline int64_t index_of(double g, int64_t n) {
     return i < 0 ? 0 : i > n - 1 ? n - 1 : i;
 }
 
-int64_t cast_rays(int64_t n_points, const double *points, int64_t n_origins, const double *origins, const double *A,
-                  const double *b, int32_t *state, const int64_t *shape, int32_t *words, const float *block,
-                  const Parameters *p, const uint8_t *moving, uint8_t *kept) {
+int64_t cast_rays(int64_t n_points, const double *points, int64_t n_origins, const double *origins,
+                  const double *anchor_m, const double *A, const double *b, int32_t *state, const int64_t *shape,
+                  int32_t *words, const float *block, const Parameters *p, const uint8_t *moving,
+                  uint8_t *kept) {
     const float *records = (const float *)words;
     const int64_t strides[3] = {shape[1] * shape[2], shape[2], 1};
     double face[3];
@@ -75,7 +76,9 @@ int64_t cast_rays(int64_t n_points, const double *points, int64_t n_origins, con
     int64_t cast = 0;
     for (int64_t ray = 0; ray < n_points; ray++) {
         kept[ray] = 0;
-        const double *o = origins + (n_origins == 1 ? 0 : 3 * ray), *end = points + 3 * ray;
+        const double *from = origins + (n_origins == 1 ? 0 : 3 * ray), *to = points + 3 * ray;
+        const double o[3] = {from[0] - anchor_m[0], from[1] - anchor_m[1], from[2] - anchor_m[2]};
+        const double end[3] = {to[0] - anchor_m[0], to[1] - anchor_m[1], to[2] - anchor_m[2]};
         const double v[3] = {end[0] - o[0], end[1] - o[1], end[2] - o[2]};
         double length = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
         if (!(length > p->range_min_m)) continue;

@@ -56,10 +56,10 @@ class Walk:
         self._jobs = []
         for points, origin in scans:
             A, b = window_affine(*local_map.grid_frame.affine(origin[0]), anchor_m, local_map.window_origin_g)
-            self._jobs.append((points - anchor_m, origin - anchor_m, A, b, np.zeros(len(points), np.bool_)))
+            self._jobs.append((points, origin, anchor_m, A, b, np.zeros(len(points), np.bool_)))
         self.crossed = sum(
-            float(np.abs(np.floor(points @ A.T + b) - np.floor(origin @ A.T + b)).sum())
-            for points, origin, A, b, _ in self._jobs
+            float(np.abs(np.floor((points - anchor_m) @ A.T + b) - np.floor((origin - anchor_m) @ A.T + b)).sum())
+            for points, origin, _, A, b, _ in self._jobs
         )
         self._block = np.ascontiguousarray(self._records.block)  # C reads row by row
         # Made once: filling fresh pages is no part of a walk. Counters go on from call to call.
@@ -71,9 +71,9 @@ class Walk:
         records = self._words.view(np.float32)
         p: KernelParameters = self._p
         return sum(
-            cast(points, origin, A, b, self._state.reshape(-1), self._state.shape, self._words, records,
+            cast(points, origin, anchor_m, A, b, self._state.reshape(-1), self._state.shape, self._words, records,
                  self._block, p, moving, kept)
-            for (points, origin, A, b, moving), kept in zip(self._jobs, self._kept, strict=True)
+            for (points, origin, anchor_m, A, b, moving), kept in zip(self._jobs, self._kept, strict=True)
         )  # fmt: skip
 
     def counts(self, cast: Any) -> Counts:

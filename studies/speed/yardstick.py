@@ -39,17 +39,18 @@ def compiled(folder: Path) -> Callable[..., int]:
     function.restype = ctypes.c_int64
 
     def cast_rays(
-        points: Any, origins: Any, A: Any, b: Any, state: Any, shape: tuple[int, int, int], words: Any,
+        points: Any, origins: Any, anchor_m: Any, A: Any, b: Any, state: Any, shape: tuple[int, int, int], words: Any,
         records: Any, block: Any, p: KernelParameters, moving: Any, kept: Any,
     ) -> int:  # fmt: skip
         parameters, sides = _Parameters(*p), np.array(shape, np.int64)
-        inputs = (np.ascontiguousarray(one, np.float64) for one in (points, origins, A, b))
-        points, origins, A, b = inputs
+        inputs = (np.ascontiguousarray(one, np.float64) for one in (points, origins, anchor_m, A, b))
+        points, origins, anchor_m, A, b = inputs
         assert np.shares_memory(words, records), "the records are the words, read as float32"
         return int(
             function(
-                ctypes.c_int64(len(points)), _at(points), ctypes.c_int64(len(origins)), _at(origins), _at(A), _at(b),
-                _at(state), _at(sides), _at(words), _at(block), ctypes.byref(parameters), _at(moving), _at(kept),
+                ctypes.c_int64(len(points)), _at(points), ctypes.c_int64(len(origins)), _at(origins), _at(anchor_m),
+                _at(A), _at(b), _at(state), _at(sides), _at(words), _at(block), ctypes.byref(parameters), _at(moving),
+                _at(kept),
             )
         )  # fmt: skip
 

@@ -46,8 +46,8 @@ def kernel_run(
     records = make_records(world.mean, cov6, np.zeros(3), p)
     state, kept = world.index.copy(), np.zeros(len(points), np.uint8)
     cast = cast_rays(
-        points, origins, A_GRID, b, state.reshape(-1), state.shape, records.words, records.floats, records.block,
-        kernel_parameters(p, pose), moving, kept,
+        points, origins, np.zeros(3), A_GRID, b, state.reshape(-1), state.shape, records.words, records.floats,
+        records.block, kernel_parameters(p, pose), moving, kept,
     )  # fmt: skip
     return records.words, state, kept, cast
 
@@ -85,8 +85,8 @@ def walked(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     state = np.full((40, 40, 40), EMPTY, np.int32)
     nothing = make_records(np.empty((0, 3)), np.empty((0, 6)), np.zeros(3), DetectParameters())
     cast_rays(
-        end[None], start[None], np.eye(3), np.zeros(3), state.reshape(-1), state.shape, nothing.words, nothing.floats,
-        nothing.block, p, np.zeros(1, np.bool_), np.zeros(1, np.uint8),
+        end[None], start[None], np.zeros(3), np.eye(3), np.zeros(3), state.reshape(-1), state.shape, nothing.words,
+        nothing.floats, nothing.block, p, np.zeros(1, np.bool_), np.zeros(1, np.uint8),
     )  # fmt: skip
     assert state.max() == EMPTY
     assert state.min() >= EMPTY - 1, "a voxel was passed twice"

@@ -7,6 +7,7 @@ import numpy as np
 
 from gnd.gnd_map.se3 import exp_so3
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 
 START_NS = 1_570_838_400_000_000_000
 HOUSES = ((-60.0, 9.0, 120.0, 10.0, 9.0), (-60.0, -10.0, 45.0, -9.0, 9.0), (-8.0, -10.0, 120.0, -9.0, 6.0))
@@ -102,4 +103,5 @@ def sweep(
     turned = T @ E @ np.linalg.inv(T)
     points, o = (p @ turned[:3, :3].T + turned[:3, 3] for p in (points, o))
     t_ns = START_NS + int(middle_s * 1e9)
-    return RefinedScan(t_ns, points, o, PoseEstimate(t_ns, turned @ T, 0.02, 0.001, 0.9, "good")), label[seen]
+    estimate = PoseEstimate(t_ns, turned @ T, 0.02, 0.001, 0.9, "good")
+    return RefinedScan(t_ns, PlacedRays(points, o), estimate), label[seen]

@@ -7,6 +7,7 @@ import pytest
 from segment_scene import PARKED, SENSORS, Mover, scans
 
 from gnd.vehicle_agent.localise.estimates import RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameterError, SegmentParameters
 
 NOISY = (0.04, 0.08)
@@ -110,10 +111,17 @@ def test_switched_off_every_scan_comes_back_at_once_and_nothing_moves() -> None:
     assert list(segmenter.flush()) == []
 
 
+def moved_up(rays: PlacedRays) -> PlacedRays:
+    return rays._replace(ends_m=rays.ends_m + 3.0)
+
+
 def test_scans_with_poor_poses_are_not_judged_and_judge_nobody() -> None:
     labelled = list(scans(SENSORS["16 layers"], (ONCOMING, WALKER), noise=NOISY))
     wrong = [
-        (replace(scan, points_map_m=scan.points_map_m + 3.0, estimate=replace(scan.estimate, health="degraded")), moves)
+        (
+            replace(scan, rays=moved_up(scan.rays), estimate=replace(scan.estimate, health="degraded")),
+            moves,
+        )
         if k % 4 == 1
         else (scan, moves)
         for k, (scan, moves) in enumerate(labelled)
@@ -128,7 +136,7 @@ def test_scans_with_poor_poses_are_not_judged_and_judge_nobody() -> None:
 def test_an_empty_scan_and_a_pause_pass_through() -> None:
     labelled = list(scans(SENSORS["16 layers"], (ONCOMING,), seconds=1.0))
     none = np.zeros((0, 3))
-    empty = replace(labelled[5][0], points_map_m=none, origins_map_m=none)
+    empty = replace(labelled[5][0], rays=PlacedRays(none, none))
     later = [replace(scan, t_ns=scan.t_ns + 60_000_000_000) for scan, _ in labelled]
     order = [scan for scan, _ in labelled[:5]] + [empty] + later
     segmenter = MotionSegmenter()

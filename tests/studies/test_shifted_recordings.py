@@ -15,6 +15,7 @@ from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.recording import NOMINAL
 from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
@@ -38,7 +39,9 @@ def moved(one: SegmentedScan, error: np.ndarray) -> SegmentedScan:
     scan, T = one.scan, one.scan.estimate.T_map_vehicle
     M = T @ error @ T_inverse(T)
     pose = PoseEstimate(scan.t_ns, T @ error, 0.02, 0.001, 0.9, "good")
-    refined = RefinedScan(scan.t_ns, transform(M, scan.points_map_m), transform(M, scan.origins_map_m), pose)
+    refined = RefinedScan(
+        scan.t_ns, PlacedRays(transform(M, scan.points_map_m), transform(M, scan.origins_map_m)), pose
+    )
     return SegmentedScan(refined, one.moving)
 
 

@@ -12,6 +12,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.segment import SegmentedScan
 
 START_NS = 1_570_838_400_000_000_000
@@ -79,5 +80,5 @@ def scan(
     moved = transform(T @ T_inverse(POSE), points)
     eye = transform(T @ T_inverse(POSE), EYE_M[None])
     pose = PoseEstimate(START_NS + number * 100_000_000, T, sigma_m, 0.0005, 0.9, health)  # type: ignore[arg-type]
-    refined = RefinedScan(pose.t_ns, moved, np.repeat(eye, len(points), axis=0), pose)
+    refined = RefinedScan(pose.t_ns, PlacedRays(moved, np.repeat(eye, len(points), axis=0)), pose)
     return SegmentedScan(refined, np.zeros(len(points), np.bool_))

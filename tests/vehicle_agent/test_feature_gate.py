@@ -13,6 +13,7 @@ from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.layers import FeatureLayers
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 
 STEP_NS = 66_000_000
@@ -39,7 +40,7 @@ def scan_at(x_m: float, t_ns: int) -> SegmentedScan:
     T[0, 3] = x_m
     rays = T[:3, 3] + np.array([[30.0, 0.0, -1.5], [0.0, 30.0, -1.5]])
     estimate = PoseEstimate(t_ns, T, 0.02, 0.001, 0.9, "good")
-    scan = RefinedScan(t_ns, rays, np.repeat(T[None, :3, 3], 2, axis=0), estimate)
+    scan = RefinedScan(t_ns, PlacedRays(rays, np.repeat(T[None, :3, 3], 2, axis=0)), estimate)
     return SegmentedScan(scan, np.zeros(2, bool))
 
 

@@ -19,6 +19,7 @@ from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.layers import placed
 from gnd.vehicle_agent.features.look import Look
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 
 START = TileId.from_path("13033/03021/23031/22102")
 FRAME = LocalFrame.of_tile(START)
@@ -103,7 +104,9 @@ def test_heights_are_those_of_the_map_on_a_slope() -> None:
         ]
         look = Detections(int(x * 1e8), "camera", "signs", ("traffic_sign",), *columns)
         estimate = PoseEstimate(look.t_ns, T.copy(), 0.01, 1e-3, 0.9, "good")
-        layer.see(placed(look, T, RefinedScan(look.t_ns, np.zeros((0, 3)), np.zeros((0, 3)), estimate)), None)
+        layer.see(
+            placed(look, T, RefinedScan(look.t_ns, PlacedRays(np.zeros((0, 3)), np.zeros((0, 3))), estimate)), None
+        )
     (found,) = [(change.tile, one) for change in layer.leave_all() for one in change.found]
     tile, point, _ = place_in_tile(FRAME, sign, np.eye(3))
     assert found[0] == tile

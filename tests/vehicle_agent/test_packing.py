@@ -28,6 +28,7 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.pipeline import known_course
 from gnd.vehicle_agent.report.packing import AT_ONCE_BYTES, Bases, askable, asked_for, is_measured, pack, pack_measured
 from gnd.vehicle_agent.report.reporter import Identity, Reporter
@@ -60,7 +61,7 @@ def drive(
     T[:3, 3] = SENSOR
     for number in range(3):
         pose = PoseEstimate(START_NS + number * 10**8, T, 0.03, 0.001, 0.9, "good")
-        scan = RefinedScan(pose.t_ns, hits, np.broadcast_to(SENSOR, hits.shape), pose)
+        scan = RefinedScan(pose.t_ns, PlacedRays(hits, np.broadcast_to(SENSOR, hits.shape)), pose)
         reporter.add_scan(SegmentedScan(scan, np.zeros(len(hits), np.bool_)))
     reporter.report_all(20.0)
     assert reporter.counts["reports_not_packed"] == 0

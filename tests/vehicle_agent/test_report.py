@@ -18,6 +18,7 @@ from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.report import reporter as reporting
 from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment import SegmentedScan
@@ -57,7 +58,7 @@ def estimate(x_m: float = 0.0, sigma_m: float = 0.03, health: str = "good", sigm
 
 def scan(hits: np.ndarray, t_s: float = 0.0, **kwargs: float | str) -> SegmentedScan:
     pose = estimate(**kwargs)  # type: ignore[arg-type]
-    refined = RefinedScan(START_NS + int(t_s * 1e9), hits, np.broadcast_to(SENSOR, hits.shape), pose)
+    refined = RefinedScan(START_NS + int(t_s * 1e9), PlacedRays(hits, np.broadcast_to(SENSOR, hits.shape)), pose)
     return SegmentedScan(refined, np.zeros(len(hits), np.bool_))
 
 

@@ -6,7 +6,6 @@ import pytest
 from gnd.gnd_map.errors import TrackError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
-from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.tracks import Tracks
 
 SECOND = 1_000_000_000
@@ -17,17 +16,16 @@ ROW = [tile for tile in ROW if tile.district == WEST.district]
 FRAME = LocalFrame.of_tile(WEST)
 
 
-def scan(t_s: float, x_m: float) -> RefinedScan:
+def see(tracks: Tracks, t_s: float, x_m: float) -> None:
     T = np.eye(4)
     T[:3, 3] = x_m, 0.0, 2.0
     points = T[:3, 3] + np.array([[5.0, 0.0, -2.0], [0.0, 9.0, -1.0], [-7.0, 1.0, 0.5]])
-    pose = PoseEstimate(int(t_s * SECOND), T, 0.02, 0.001, 0.9, "good")
-    return RefinedScan(pose.t_ns, points, np.broadcast_to(T[:3, 3], points.shape), pose)
+    tracks.add_scan(int(t_s * SECOND), points, np.broadcast_to(T[:3, 3], points.shape), T)
 
 
 def drive(tracks: Tracks, first_s: float, xs: np.ndarray) -> None:
     for k, x_m in enumerate(xs.tolist()):
-        tracks.add_scan(scan(first_s + 0.1 * k, x_m))
+        see(tracks, first_s + 0.1 * k, x_m)
 
 
 def test_a_report_has_the_scans_that_were_near_its_tiles() -> None:

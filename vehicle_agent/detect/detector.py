@@ -48,7 +48,6 @@ class ChangeDetector:
         self._poses = TileUncertainties(local_map.grid_frame)
         self._window: _VoxelWindow | None = None
         self._sees_heights = False
-        self._room = [np.empty((0, 3)), np.empty((0, 3))]
 
     def add_scan(
         self,
@@ -90,9 +89,8 @@ class ChangeDetector:
         affine = self.local_map.grid_frame.affine(middle)
         A, b = window_affine(*affine, window.anchor_m, window.origin_g)
         kept = np.zeros(len(points), np.uint8)
-        ends, starts = self._about(points, window.anchor_m, 0), self._about(origins, window.anchor_m, 1)
         cast = cast_rays(
-            ends, starts, A, b, window.state.reshape(-1), window.state.shape,
+            points, origins, window.anchor_m, A, b, window.state.reshape(-1), window.state.shape,
             window.records.words, window.records.floats, window.records.block,
             kernel_parameters(self.parameters, pose), moves, kept,
         )  # fmt: skip
@@ -100,12 +98,6 @@ class ChangeDetector:
         evidence = np.flatnonzero(kept)
         self._poses.add_scan(points[evidence[:: poses_step(len(evidence))]], len(evidence), middle, affine, pose)
         return cast
-
-    def _about(self, points: F64, anchor_m: F64, which: int) -> F64:
-        """Points (N, 3) relative to an anchor (3,), in memory that stays: new pages cost more than the difference."""
-        if len(self._room[which]) < len(points):
-            self._room[which] = np.empty((len(points), 3))
-        return np.subtract(points, anchor_m, out=self._room[which][: len(points)])
 
     def touched(self, tile_id: TileId) -> bool:
         """Whether there is evidence about a voxel of this tile."""

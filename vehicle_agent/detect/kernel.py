@@ -231,6 +231,7 @@ def _index(g: float, n: int) -> int:
 def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the voxel)
     points: F64,
     origins: F64,
+    anchor_m: F64,
     A: F64,
     b: F64,
     state: I32,
@@ -245,8 +246,9 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
     """Cast the rays of one scan: counts into `state` and `words`, marks the points that new Gaussians are made of.
 
     Args:
-        points: (N, 3) float64 hits in metres relative to the window's anchor, map axes.
+        points: (N, 3) float64 hits in metres, map frame.
         origins: (N, 3) or (1, 3) float64 the sensor at each hit, the same frame.
+        anchor_m: (3,) float64 the window's anchor, from which the records' means are counted; so are p of A and b.
         A: (3, 3) float64; window coordinates are A @ p + b.
         b: (3,) float64.
         state: (nx * ny * nz,) int32, changed: row of a Gaussian >= 0, -1 - (passes) where empty, `UNKNOWN`.
@@ -271,8 +273,8 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
     for r in range(len(points)):
         kept[r] = 0
         o = 0 if one_origin else r
-        ox, oy, oz = origins[o, 0], origins[o, 1], origins[o, 2]
-        px, py, pz = points[r, 0], points[r, 1], points[r, 2]
+        ox, oy, oz = origins[o, 0] - anchor_m[0], origins[o, 1] - anchor_m[1], origins[o, 2] - anchor_m[2]
+        px, py, pz = points[r, 0] - anchor_m[0], points[r, 1] - anchor_m[1], points[r, 2] - anchor_m[2]
         vx, vy, vz = px - ox, py - oy, pz - oz
         length = math.sqrt(vx * vx + vy * vy + vz * vz)
         if not (length > p.range_min_m):

@@ -53,12 +53,11 @@ class _TrialScan:
     @classmethod
     def of(cls, segmented: SegmentedScan) -> "_TrialScan":
         scan = segmented.scan
-        rays, _ = PackedRays.of(scan.points_map_m, scan.origins_map_m)
-        return cls(scan.t_ns, scan.estimate, rays, segmented.moving)
+        return cls(scan.t_ns, scan.estimate, scan.rays.packed(), segmented.moving)
 
     def restore(self) -> SegmentedScan:
         """The scan as it came."""
-        return SegmentedScan(RefinedScan(self.t_ns, *self.rays.restore(), self.estimate), self.moving)
+        return SegmentedScan(RefinedScan(self.t_ns, self.rays, self.estimate), self.moving)
 
     def still(self, every: int = 1, centre_m: F64 | None = None) -> F32:
         """(K, 3) every so many of the points that stand, from the centre of its rays or another one (3,)."""

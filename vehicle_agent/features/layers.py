@@ -197,7 +197,8 @@ def still(segmented: SegmentedScan) -> Rays:
     """The rays that end on what does not move, map frame."""
     kept, scan = ~segmented.moving, segmented.scan
     sigma = PoseSigma(scan.estimate.sigma_m, scan.estimate.sigma_rad)
-    return Rays(scan.points_map_m[kept], scan.origins_map_m[kept], sigma)
+    ends_m, starts_m = scan.rays.restore()
+    return Rays(ends_m[kept], starts_m[kept], sigma)
 
 
 def occlusion_of(scan: RefinedScan) -> Occlusion:

@@ -10,6 +10,7 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.packed_rays import PackedRays, PlacedRays
 
 Health = Literal["good", "degraded", "lost"]
 Cause = Literal[
@@ -49,14 +50,29 @@ class PoseEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedScan:
-    """A scan whose pose is final: `points_map_m` and `origins_map_m` (N, 3) float64, end and start of each ray, in
-    firing order, sweep motion removed.
+    """A scan whose pose is final: its rays in the map frame, in firing order, sweep motion removed.
+
+    They stay packed from the place where they were placed to the counting of what they met: arrays of a whole scan that
+    come and go between those that wait leave gaps in the heap.
     """
 
     t_ns: int
-    points_map_m: F64
-    origins_map_m: F64
+    rays: PlacedRays | PackedRays
     estimate: PoseEstimate
+
+    def __len__(self) -> int:
+        """How many rays."""
+        return len(self.rays.points_m if isinstance(self.rays, PackedRays) else self.rays.ends_m)
+
+    @property
+    def points_map_m(self) -> F64:
+        """(N, 3) float64 the ends of the rays; unpacked at each call."""
+        return self.rays.restore()[0]
+
+    @property
+    def origins_map_m(self) -> F64:
+        """(N, 3) float64 their starts; unpacked at each call."""
+        return self.rays.restore()[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

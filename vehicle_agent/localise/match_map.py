@@ -55,28 +55,31 @@ class MatchMap:
 
 
 class MatchMapCache:
-    """The `MatchMap` of a `LocalMap`, made again when the map has changed; its grid linearised where the vehicle is."""
+    """The `MatchMap` of a `LocalMap`, made again when the map has changed; its grid linearised where the vehicle is.
+
+    What is made stays with the map and goes with it. Several caches of one map share all but the linearisation.
+    """
 
     def __init__(self, local_map: LocalMap, noise_m: float) -> None:
         self.local_map = local_map
         self.noise_m = noise_m
-        self._generation = -1
         self._near_m = np.full(3, np.inf)
-        self._made: MatchMap | None = None
 
     def near(self, p_map_m: F64) -> MatchMap:
         """The map with its grid linearised within `LINEAR_M` of `p_map_m` (3,)."""
-        moved = float(np.abs(p_map_m - self._near_m).max())
-        if self._made is None or self._generation != self.local_map.generation or not moved < LINEAR_M / 3:
-            self._made = self._make(p_map_m)
-        return self._made
+        made: MatchMap | None = self.local_map.derived.get(self)
+        if made is None or not float(np.abs(p_map_m - self._near_m).max()) < LINEAR_M / 3:
+            made = self._make(p_map_m)
+        return made
 
     def _make(self, p_map_m: F64) -> MatchMap:
-        held = self.local_map
+        held, shared = self.local_map, ("match map", self.noise_m)
         A, b = held.grid_frame.affine(p_map_m)
         A, b = np.ascontiguousarray(A), b - held.window_origin_g  # kernels are compiled for one layout
+        like: MatchMap | None = held.derived.get(shared)
+        if like is None:
+            like = MatchMap.of(held.index, A, b, held.mean_map_m, held.cov_m2, self.noise_m)
+        made = MatchMap(like.index, A, b, like.mean_m, like.information)
+        held.derived[shared] = held.derived[self] = made
         self._near_m = np.array(p_map_m, dtype=np.float64)
-        if self._made is not None and self._generation == held.generation:
-            return MatchMap(held.index, A, b, self._made.mean_m, self._made.information)
-        self._generation = held.generation
-        return MatchMap.of(held.index, A, b, held.mean_map_m, held.cov_m2, self.noise_m)
+        return made

@@ -18,6 +18,7 @@ from gnd.vehicle_agent.localise.map_matcher import MapMatcher
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.remount import lever_covariance
 from gnd.vehicle_agent.localise.sweep import Sweeps
+from gnd.vehicle_agent.packed_rays import PackedRays
 
 _MOUNTED_M: Final = 0.003
 _MOUNTED_RAD: Final = np.radians(0.02)
@@ -62,7 +63,7 @@ class PoseOutput:
         if not sees_tilt(scan.points):
             pose = self._matcher.on_the_road(pose)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
-        ends, starts = scan.placed(sweep, self._mounting.T_used, held.t_ns, pose.T_map_vehicle)
+        rays = PackedRays.of(*scan.placed(sweep, self._mounting.T_used, held.t_ns, pose.T_map_vehicle))[0]
         pose = replace(pose, covariance=pose.covariance + self._sweeps.pose_covariance(held.t_ns, held.unsure))
         estimate = estimate_of(self._of_vehicle(pose), held)
         health, cause = estimate.health, estimate.cause
@@ -71,7 +72,7 @@ class PoseOutput:
         health, cause = self.judged(health, cause)
         if disagrees and not pose.certain and health == "good":
             health, cause = "degraded", "disputed"
-        return RefinedScan(held.t_ns, ends, starts, replace(estimate, health=health, cause=cause, disagrees=disagrees))
+        return RefinedScan(held.t_ns, rays, replace(estimate, health=health, cause=cause, disagrees=disagrees))
 
     @property
     def _trim_rad(self) -> float:

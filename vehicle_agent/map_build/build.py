@@ -34,6 +34,7 @@ from gnd.vehicle_agent.map_build.bodywork import HIGH_M, LOW_M, Bodywork
 from gnd.vehicle_agent.map_build.placed_scans import NoPose, drive_scans, placed, why_no_pose
 from gnd.vehicle_agent.map_build.refine_poses import PosesReport, RefineMode, refine_poses
 from gnd.vehicle_agent.map_build.survey import DriveSurvey, Progress, look_over
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameters
 
 MOVERS: Final = SegmentParameters(range_max_m=80.0)
@@ -178,4 +179,4 @@ def _without(one: RefinedScan, bodywork: Bodywork, counts: BuiltDrive) -> Refine
     kept = np.ones(len(one.points_map_m), np.bool_)
     kept[own] = False
     counts.bodywork += len(own)
-    return RefinedScan(one.t_ns, one.points_map_m[kept], one.origins_map_m[kept], one.estimate)
+    return RefinedScan(one.t_ns, PlacedRays(one.points_map_m[kept], one.origins_map_m[kept]), one.estimate)

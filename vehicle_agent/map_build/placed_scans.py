@@ -11,6 +11,7 @@ from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import read_drive
 from gnd.tile_store.build import MapSource
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 
 NoPose = Literal["before the first pose", "after the last pose", "without a point in range"]
 
@@ -52,4 +53,4 @@ def placed(scan: Scan, poses: Trajectory, T_vehicle_lidar: np.ndarray, range_m: 
         transform(T, deskew(p, offset_ns, scan.t_ns, poses, T_vehicle_lidar, t_ns))
         for p in (points_m, np.zeros_like(points_m))
     )
-    return RefinedScan(t_ns, ends, starts, PoseEstimate(t_ns, T, 0.0, 0.0, 1.0, "good"))
+    return RefinedScan(t_ns, PlacedRays(ends, starts), PoseEstimate(t_ns, T, 0.0, 0.0, 1.0, "good"))

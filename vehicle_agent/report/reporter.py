@@ -241,9 +241,10 @@ class Reporter:
     def _remember(self, segmented: SegmentedScan, what: str) -> None:
         """Tiles seen by a scan whose pose is to be noted."""
         scan = segmented.scan
-        if len(scan.points_map_m):
-            centre = scan.origins_map_m[0]
-            points = (scan.points_map_m - centre).astype(np.float32)
+        if len(scan):
+            ends_m, starts_m = scan.rays.restore()
+            centre = starts_m[0]
+            points = (ends_m - centre).astype(np.float32)
             self._doubts.poor(some_of(points, centre, POINTS_OF_POOR_SCAN), what)
 
     def _hear_trial(self) -> None:
@@ -264,14 +265,14 @@ class Reporter:
         self.counts["scans_used"] += 1
         self.counts["points"] += len(segmented.moving)
         self.counts["moving_points"] += int(np.count_nonzero(segmented.moving))
-        rays = looked_at(scan.points_map_m) - looked_at(scan.origins_map_m)
-        along_vehicle = rays @ scan.estimate.T_map_vehicle[:3, :3]
+        ends_m, starts_m = scan.rays.restore()
+        along_vehicle = (looked_at(ends_m) - looked_at(starts_m)) @ scan.estimate.T_map_vehicle[:3, :3]
         self.counts["rays"] += self._detector.add_scan(
-            scan.points_map_m, scan.origins_map_m, segmented.moving, pose, sees_heights=spreads(along_vehicle)
+            ends_m, starts_m, segmented.moving, pose, sees_heights=spreads(along_vehicle)
         )
         self._T_map_vehicle = scan.estimate.T_map_vehicle
         self._lengthen(scan.t_ns)
-        self._tracks.add_scan(scan)
+        self._tracks.add_scan(scan.t_ns, ends_m, starts_m, scan.estimate.T_map_vehicle)
 
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float, *, busy: bool = False) -> None:
         """Decide the tiles that the refined pose has left, and report what has waited long enough; with the next scan,

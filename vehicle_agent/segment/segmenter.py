@@ -67,7 +67,7 @@ class _LaggedScan:
 
     def restore(self) -> RefinedScan:
         """The scan as it came."""
-        return RefinedScan(self.t_ns, *self.rays.restore(), self.estimate)
+        return RefinedScan(self.t_ns, self.rays, self.estimate)
 
 
 class MotionSegmenter:
@@ -84,7 +84,7 @@ class MotionSegmenter:
     def push(self, scan: RefinedScan) -> list[SegmentedScan]:
         """Take a scan; give those that no later scan is compared with any more, oldest first."""
         if not self.parameters.enabled:
-            return [SegmentedScan(scan, np.zeros(len(scan.points_map_m), np.bool_))]
+            return [SegmentedScan(scan, np.zeros(len(scan), np.bool_))]
         p = self.parameters
         self._take(scan)
         return list(self._released(scan.t_ns - round(p.future_s * _S)))
@@ -96,8 +96,8 @@ class MotionSegmenter:
 
     def _take(self, scan: RefinedScan) -> None:
         p, objects = self.parameters, None
-        rays, origins = PackedRays.of(scan.points_map_m, scan.origins_map_m)
-        centre, points = rays.centre_m, rays.points_m
+        rays = scan.rays.packed()
+        centre, points, origins = rays.centre_m, rays.points_m, rays.starts_from_centre()
         if len(points) and scan.estimate.health == "good":
             ground = self._ground.around(points, centre, scan.estimate.T_map_vehicle, self._tan_low)
             objects = find_all_objects(points, origins, ground, self._gap_tan, p)

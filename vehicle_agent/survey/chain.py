@@ -14,6 +14,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import GnssFix
 from gnd.schemas.survey import SurveyAnchor, SurveyFix, SurveyMotion, SurveySubmap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from gnd.vehicle_agent.survey.odometry import OdometryScan, between
 
@@ -90,7 +91,7 @@ class SubmapChain:
         if scan.way_m - self._added_way_m >= ADDED_M:
             self._added_way_m = scan.way_m
             estimate = PoseEstimate(scan.t_ns, scan.T_odom_vehicle, 0.0, 0.0, 1.0, "good")
-            self._add(self._segmenter.push(RefinedScan(scan.t_ns, scan.points_m, scan.origins_m, estimate)))
+            self._add(self._segmenter.push(RefinedScan(scan.t_ns, PlacedRays(scan.points_m, scan.origins_m), estimate)))
 
     def take_fix(self, fix: GnssFix, T_odom_vehicle: F64) -> None:
         """Take a position from satellites at a pose of the odometry."""
