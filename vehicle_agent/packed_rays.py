@@ -54,14 +54,19 @@ class PackedRays:
         """Ends and starts (N, 3), float64, map frame."""
         return _restored(self.points_m, self.starts, self.until, self.step_m, self.centre_m)
 
+    def __len__(self) -> int:
+        """How many rays."""
+        return len(self.points_m)
+
     def packed(self) -> "PackedRays":
         """Themselves."""
         return self
 
-    def starts_from_centre(self) -> F32:
-        """(N, 3) float32, metres."""
+    def from_centre(self) -> tuple[F32, F32]:
+        """Ends and starts (N, 3), float32, from the centre."""
         step_m = np.float32(self.step_m)
-        return np.repeat(self.starts.astype(np.float32) * step_m, np.diff(self.until, prepend=0), axis=0)
+        starts = np.repeat(self.starts.astype(np.float32) * step_m, np.diff(self.until, prepend=0), axis=0)
+        return self.points_m, starts
 
     @classmethod
     def of(cls, points_m: F64, starts_m: F64) -> tuple["PackedRays", F32]:

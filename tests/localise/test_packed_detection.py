@@ -28,7 +28,7 @@ def exact(scan, sweep, mount, t_ns, T):
 
 
 def packed(scan, sweep, mount, t_ns, T):
-    return pack(scan).placed(sweep, mount, t_ns, T)
+    return pack(scan).placed(sweep, mount, t_ns, T).restore()
 
 
 def classes_of(path, local_map, rays_of):

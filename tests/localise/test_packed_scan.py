@@ -39,11 +39,24 @@ def plain(scan, reference_ns, T_map_vehicle):
 def test_rays_lie_where_the_plain_way_puts_them(reach_m, limit_m):
     """Half a step each axis: at 60 m 0.9 mm, at 120 m 1.8 mm; beyond what 16 bits hold, nothing is rounded."""
     scan, T, reference_ns = scan_of(reach_m, bad=7), pose(30.0, -20.0, 40.0), 1_000 + SWEEP_NS // 2
-    ends, starts = pack(scan).placed(sweep(), MOUNT, reference_ns, T)
+    ends, starts = pack(scan).placed(sweep(), MOUNT, reference_ns, T).restore()
     want_ends, want_starts = plain(scan, reference_ns, T)
     assert ends.shape == want_ends.shape == (3993, 3)
     assert np.abs(starts - want_starts).max() < 2e-5  # a tick is 2 µs, the vehicle does 12 m/s
     assert np.linalg.norm(ends - want_ends, axis=1).max() < limit_m
+
+
+@pytest.mark.parametrize("reach_m", [120.0, 2 * MAX_REACH_M])
+def test_rays_from_their_centre_are_those_of_the_map_frame(reach_m):
+    rays = pack(scan_of(reach_m)).placed(sweep(), MOUNT, 1_000, pose(812.0, -4711.0, 40.0))
+    ends, starts = rays.restore()
+    points, origins = rays.from_centre()
+    assert points.dtype == origins.dtype == np.float32
+    assert len(rays) == len(points)
+    np.testing.assert_array_equal(points, rays.points_m)
+    np.testing.assert_allclose(points + rays.centre_m, ends, atol=2e-5)
+    np.testing.assert_allclose(origins + rays.centre_m, starts, atol=1e-6)
+    assert np.linalg.norm(starts - rays.centre_m, axis=1).max() < 1.0, "12 m/s, half a sweep"
 
 
 def test_a_packed_scan_is_half_as_large():
@@ -54,7 +67,7 @@ def test_a_packed_scan_is_half_as_large():
 def test_a_scan_of_no_finite_point_is_empty():
     packed = pack(scan_of(50.0, n=60, bad=60))
     assert len(packed) == 0
-    ends, starts = packed.placed(sweep(), MOUNT, 1_000, np.eye(4))
+    ends, starts = packed.placed(sweep(), MOUNT, 1_000, np.eye(4)).restore()
     assert ends.shape == starts.shape == (0, 3)
 
 

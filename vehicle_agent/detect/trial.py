@@ -20,12 +20,11 @@ from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.detect.recent_map import recent_map
 from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, find_shift, gain
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
-from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan, WaitingRays
 from gnd.vehicle_agent.localise.level import looked_at, spreads
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import SamplingParameters
 from gnd.vehicle_agent.localise.sampling import sample_scan
-from gnd.vehicle_agent.packed_rays import PackedRays
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from gnd.vehicle_agent.waiting import next_few
 
@@ -47,7 +46,7 @@ class _TrialScan:
 
     t_ns: int
     estimate: PoseEstimate
-    rays: PackedRays
+    rays: WaitingRays
     moving: NDArray[np.bool_]
 
     @classmethod

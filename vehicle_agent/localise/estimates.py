@@ -10,7 +10,11 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.packed_scan import SweptRays
 from gnd.vehicle_agent.packed_rays import PackedRays, PlacedRays
+
+WaitingRays = PackedRays | SweptRays
+"""Rays in a form that takes little memory; both forms answer to the same names."""
 
 Health = Literal["good", "degraded", "lost"]
 Cause = Literal[
@@ -52,17 +56,17 @@ class PoseEstimate:
 class RefinedScan:
     """A scan whose pose is final: its rays in the map frame, in firing order, sweep motion removed.
 
-    They stay packed from the place where they were placed to the counting of what they met: arrays of a whole scan that
-    come and go between those that wait leave gaps in the heap.
+    They stay packed until what they met is counted: arrays of a whole scan that come and go between those that wait
+    leave gaps in the heap.
     """
 
     t_ns: int
-    rays: PlacedRays | PackedRays
+    rays: PlacedRays | WaitingRays
     estimate: PoseEstimate
 
     def __len__(self) -> int:
         """How many rays."""
-        return len(self.rays.points_m if isinstance(self.rays, PackedRays) else self.rays.ends_m)
+        return len(self.rays.ends_m if isinstance(self.rays, PlacedRays) else self.rays)
 
     @property
     def points_map_m(self) -> F64:

@@ -6,12 +6,13 @@ that reaches beyond MAX_REACH_M is kept as it is. Points that are not finite are
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.jit import bare, kernel
+from gnd.gnd_map.arrays import F32, F64
+from gnd.gnd_map.jit import bare
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.schemas.drive import Scan
@@ -47,8 +48,8 @@ class PackedScan:
         """Bytes of the columns."""
         return self.points.nbytes + self.ticks.nbytes
 
-    def placed(self, sweep: Trajectory, T_vehicle_lidar: F64, reference_ns: int, T_map_vehicle: F64) -> tuple[F64, F64]:
-        """Ends and starts of the rays, (N, 3) each, float64, map frame, sweep motion removed.
+    def placed(self, sweep: Trajectory, T_vehicle_lidar: F64, reference_ns: int, T_map_vehicle: F64) -> "SweptRays":
+        """Its rays in the map frame, sweep motion removed.
 
         Args:
             sweep: the vehicle's motion during the sweep, in any frame.
@@ -60,7 +61,59 @@ class PackedScan:
         T_map_dst = T_map_vehicle @ T_inverse(sweep.at(reference_ns))
         T_map_lidar = T_map_dst @ sweep.at(knots_ns) @ T_vehicle_lidar
         knots = np.ascontiguousarray(T_map_lidar[:, :3, :])
-        return place_rays(self.points, self.ticks, self.step_m, self.tick_ns, KNOT_NS, knots)
+        return SweptRays(self.points, self.ticks, self.step_m, self.tick_ns, knots)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweptRays:
+    """Rays of a packed scan and where its LiDAR was. They are placed each time they are asked for: that takes less than
+    to hold them placed.
+
+    Attributes:
+        points, ticks, step_m, tick_ns: as of the `PackedScan`, whose memory it is.
+        knots: (K, 3, 4) float64 pose of the LiDAR in the map frame every `KNOT_NS` from the start of the sweep.
+    """
+
+    points: Points
+    ticks: Ticks
+    step_m: float
+    tick_ns: int
+    knots: F64
+
+    def __len__(self) -> int:
+        """How many rays."""
+        return len(self.points)
+
+    @property
+    def centre_m(self) -> F64:
+        """(3,) float64, map frame: the LiDAR in the middle of the sweep."""
+        return self.knots[len(self.knots) // 2, :, 3].copy()
+
+    @property
+    def points_m(self) -> F32:
+        """(N, 3) float32 their ends from the centre."""
+        ends: F32 = self._placed(np.float32, self.centre_m, 0)[0]
+        return ends
+
+    def from_centre(self) -> tuple[F32, F32]:
+        """Ends and starts (N, 3), float32, from the centre."""
+        return self._placed(np.float32, self.centre_m, len(self))
+
+    def restore(self) -> tuple[F64, F64]:
+        """Ends and starts (N, 3), float64, map frame."""
+        return self._placed(np.float64, np.zeros(3), len(self))
+
+    def packed(self) -> "SweptRays":
+        """Themselves."""
+        return self
+
+    def _placed(self, dtype: Any, centre_m: F64, n_starts: int) -> tuple[Any, Any]:
+        ends, starts = np.empty((len(self), 3), dtype), np.empty((n_starts, 3), dtype)
+        place_rays(
+            self.points, self.ticks, self.step_m, self.tick_ns, KNOT_NS, self.knots, centre_m, np.empty((3, 4)), ends,
+            starts,
+        )  # fmt: skip
+        return ends, starts
 
 
 def pack(scan: Scan) -> PackedScan:
@@ -106,25 +159,29 @@ def squeeze(
         k += 1
 
 
-@kernel
-def place_rays(points: Points, ticks: Ticks, step_m: float, tick_ns: int, knot_ns: int, knots: F64) -> tuple[F64, F64]:
-    """Ends and starts (N, 3) of the rays under the LiDAR's pose blended between the two knots (K, 3, 4) around each
-    point's time.
+@bare
+def place_rays(
+    points: Points, ticks: Ticks, step_m: float, tick_ns: int, knot_ns: int, knots: F64, centre_m: F64, T: F64,
+    ends: F32 | F64, starts: F32 | F64,
+) -> None:  # fmt: skip
+    """Fill ends and starts (N, 3) of the rays, from a centre (3,), under the LiDAR's pose blended between the two knots
+    (K, 3, 4) around each point's time; starts (0, 3) are left out. `T` (3, 4) is room for that pose: it serves all
+    points of one time.
     """
-    ends, starts = np.empty((points.shape[0], 3)), np.empty((points.shape[0], 3))
+    tick = np.int64(-1)
     for n in range(points.shape[0]):
-        t = np.int64(ticks[n]) * tick_ns
-        k = t // knot_ns
-        after = (t - k * knot_ns) / knot_ns
-        before = 1.0 - after
+        if np.int64(ticks[n]) != tick:
+            tick = np.int64(ticks[n])
+            t = tick * tick_ns
+            k = t // knot_ns
+            after = (t - k * knot_ns) / knot_ns
+            before = 1.0 - after
+            for row in range(3):
+                for column in range(4):
+                    T[row, column] = before * knots[k, row, column] + after * knots[k + 1, row, column]
         x, y, z = points[n, 0] * step_m, points[n, 1] * step_m, points[n, 2] * step_m
         for row in range(3):
-            start = before * knots[k, row, 3] + after * knots[k + 1, row, 3]
-            starts[n, row] = start
-            ends[n, row] = (
-                start
-                + (before * knots[k, row, 0] + after * knots[k + 1, row, 0]) * x
-                + (before * knots[k, row, 1] + after * knots[k + 1, row, 1]) * y
-                + (before * knots[k, row, 2] + after * knots[k + 1, row, 2]) * z
-            )
-    return ends, starts
+            ends[n, row] = T[row, 3] + T[row, 0] * x + T[row, 1] * y + T[row, 2] * z - centre_m[row]
+        if starts.shape[0] != 0:
+            for row in range(3):
+                starts[n, row] = T[row, 3] - centre_m[row]

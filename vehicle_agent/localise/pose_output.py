@@ -18,7 +18,6 @@ from gnd.vehicle_agent.localise.map_matcher import MapMatcher
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.remount import lever_covariance
 from gnd.vehicle_agent.localise.sweep import Sweeps
-from gnd.vehicle_agent.packed_rays import PackedRays
 
 _MOUNTED_M: Final = 0.003
 _MOUNTED_RAD: Final = np.radians(0.02)
@@ -63,7 +62,7 @@ class PoseOutput:
         if not sees_tilt(scan.points):
             pose = self._matcher.on_the_road(pose)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
-        rays = PackedRays.of(*scan.placed(sweep, self._mounting.T_used, held.t_ns, pose.T_map_vehicle))[0]
+        rays = scan.placed(sweep, self._mounting.T_used, held.t_ns, pose.T_map_vehicle)
         pose = replace(pose, covariance=pose.covariance + self._sweeps.pose_covariance(held.t_ns, held.unsure))
         estimate = estimate_of(self._of_vehicle(pose), held)
         health, cause = estimate.health, estimate.cause

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from gnd.vehicle_agent.packed_rays import PackedRays
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan, WaitingRays
 from gnd.vehicle_agent.segment.parameters import PAST_S, SegmentParameters
 from gnd.vehicle_agent.segment.scene import (
     SEGMENT_VOXEL_M,
@@ -62,7 +61,7 @@ class _LaggedScan:
 
     t_ns: int
     estimate: PoseEstimate
-    rays: PackedRays
+    rays: WaitingRays
     objects: Objects | None
 
     def restore(self) -> RefinedScan:
@@ -97,7 +96,7 @@ class MotionSegmenter:
     def _take(self, scan: RefinedScan) -> None:
         p, objects = self.parameters, None
         rays = scan.rays.packed()
-        centre, points, origins = rays.centre_m, rays.points_m, rays.starts_from_centre()
+        centre, (points, origins) = rays.centre_m, rays.from_centre()
         if len(points) and scan.estimate.health == "good":
             ground = self._ground.around(points, centre, scan.estimate.T_map_vehicle, self._tan_low)
             objects = find_all_objects(points, origins, ground, self._gap_tan, p)
@@ -144,10 +143,10 @@ class MotionSegmenter:
     def _moving(self, held: _LaggedScan) -> Mask:
         objects = held.objects
         if objects is None:
-            return np.zeros(len(held.rays.points_m), np.bool_)
+            return np.zeros(len(held.rays), np.bool_)
         moves = decide(objects)
         if not moves.any():
-            return np.zeros(len(held.rays.points_m), np.bool_)
+            return np.zeros(len(held.rays), np.bool_)
         table = hash_table(int(moves.sum()))
         voxel_of = objects.voxel_of.astype(np.int32, copy=False)
         return moving_points(held.rays.points_m, voxel_of, objects.index, moves, SEGMENT_VOXEL_M, *table)
