@@ -247,7 +247,7 @@ class Pipeline(Generic[TilesT]):
             self._take_pose(refined, poses)
             if self.change is not None:
                 for scan in self.change.segmenter.push(refined):  # rays against rays of other scans -> which move
-                    self.change.detect(scan)  # rays + tiles -> evidence and new Gaussians
+                    self.change.detect(scan, busy=self._busy)  # rays + tiles -> evidence and new Gaussians
                     self.change.report(scan, self.place.odometer_m, busy=self._busy)  # tiles left -> classes -> reports
                     self._judge(scan)  # observations + feature tiles -> what exists, is gone, is new -> reports
         self._note(item)
@@ -418,11 +418,13 @@ class ChangeDetection:
         reporter = Reporter(detector, outbox, identity, start_ns, parameters.report, course, parts.statement)
         return cls(MotionSegmenter(parameters.segment), detector, reporter, parts.watch)
 
-    def detect(self, scan: SegmentedScan) -> None:
-        """Count the rays of a scan whose pose is final and whose movers are known."""
+    def detect(self, scan: SegmentedScan, *, busy: bool = False) -> None:
+        """Take a scan whose pose is final and whose movers are known; count the rays of those that stood the test, with
+        the next scan if the vehicle is busy with something else that takes long.
+        """
         for watch in self.watch:
             watch(scan)
-        self.reporter.add_scan(scan)
+        self.reporter.add_scan(scan, busy=busy)
 
     def report(self, scan: SegmentedScan, odometer_m: float, *, busy: bool) -> None:
         """Decide the tiles that this scan's pose has left behind; what has waited long enough is reported."""

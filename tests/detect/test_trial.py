@@ -1,6 +1,6 @@
 """Scans on trial: which of them become evidence when poses go wrong for a while, and when the pose is lost."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
@@ -49,6 +49,21 @@ def test_right_poses_become_evidence_a_second_later_at_most_and_all_at_the_end(
     assert not one.counts
     assert {tried.verdict for tried in one.take_tried()} == {"good"}
     assert one.take_tried() == []
+
+
+@pytest.mark.parametrize("busy", [lambda k: k % 5 == 0, lambda _: True], ids=["now and then", "always"])
+def test_a_busy_vehicle_counts_a_scan_later_and_all_in_order(
+    yard: LocalMap, points: list[np.ndarray], busy: Callable[[int], bool]
+) -> None:
+    one, counted, most = trial(yard), list[int](), 0
+    for k in range(60):
+        found = numbers(one.push(scan(points[k % len(points)], k), busy=busy(k)))
+        assert not (busy(k) and not busy(k - 1) and found), "it waits for the next scan"
+        counted += found
+        most = max(most, k - len(counted))
+    assert counted == list(range(len(counted)))
+    assert most <= 4 * SEGMENT, "what waits does not grow"
+    assert counted + numbers(one.flush()) == list(range(60))
 
 
 def test_scans_come_out_as_they_went_in(yard: LocalMap, points: list[np.ndarray]) -> None:

@@ -18,6 +18,7 @@ PROGRAM = textwrap.dedent(
     from gnd.gnd_map.codec import kernels as coders, voxel_kernels
     INNER = {"cholesky", "newton_step", "principal", "by_levers", "descend", "rotation_of", "without_hints"}
     USED = (coders.code_bit, coders.code_bits, coders.code_flags, coders.code_plain, voxel_kernels.code_voxels)
+    FORMS = {"place_rays": 2}  # float32 from a centre, float64 in the map frame
     before = len(kernel.cast_rays.signatures)
     warm_up()
     first = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
@@ -26,7 +27,7 @@ PROGRAM = textwrap.dedent(
     cold = [
         f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles, fit_kernel)
         for k, v in vars(m).items()
-        if hasattr(v, "signatures") and not k.startswith("_") and k not in INNER and len(v.signatures) != 1
+        if hasattr(v, "signatures") and not k.startswith("_") and k not in INNER and len(v.signatures) != FORMS.get(k, 1)
     ]
     print(json.dumps({
         "cold": cold, "coders": [k.__name__ for k in USED if len(k.signatures) != 1],

@@ -36,6 +36,8 @@ _POINTS_OF_SEGMENT: Final = 3000
 _LEAST_POINTS_OF_SCAN: Final = 300
 POINTS_OF_POOR_SCAN: Final = 300
 _MAX_RANGE_M: Final = 50.0
+_MOST_AT_ONCE: Final = 2
+"""Scans whose rays are counted with one scan: one comes with each, and a segment at most comes at once."""
 _EVERY_RECENT: Final = 2
 """So many of the last good segment's points are enough to compare with."""
 
@@ -123,12 +125,16 @@ class Trial:
         self._stood: deque[_TrialScan] = deque()
         """Evidence that was not given yet: a whole segment stands the test at once, and is given scan by scan."""
         self._wrong = False  # the segment before was
+        self._waited = False  # to give evidence, for a scan
         self._tried: deque[Tried] = deque()
         self._refused_until_ns = -1
         self._recent: _Recent | None = None
 
-    def push(self, segmented: SegmentedScan) -> Iterator[SegmentedScan]:
-        """Take a scan; give those that are evidence now, oldest first."""
+    def push(self, segmented: SegmentedScan, *, busy: bool = False) -> Iterator[SegmentedScan]:
+        """Take a scan; give those that are evidence now, oldest first.
+
+        None, but not twice in a row, if the vehicle is busy with something else that takes long.
+        """
         t_ns = segmented.scan.t_ns
         if t_ns <= self._refused_until_ns:
             self.counts["scans_taken_back"] += 1
@@ -138,8 +144,10 @@ class Trial:
         if self._open is None:
             self._open = _Segment(t_ns)
         self._open.scans.append(_TrialScan.of(segmented))
-        for stood in next_few(self._stood):
-            yield stood.restore()
+        self._waited = busy and not self._waited
+        if not self._waited:
+            for stood in next_few(self._stood, _MOST_AT_ONCE):
+                yield stood.restore()
 
     def flush(self) -> Iterator[SegmentedScan]:
         """The drive has ended: give what has stood the test until now."""

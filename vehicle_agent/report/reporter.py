@@ -206,8 +206,10 @@ class Reporter:
         self._shifted = 0
         self._waited = False  # to decide and report, for a scan
 
-    def add_scan(self, segmented: SegmentedScan) -> None:
-        """Count the scan's rays, if its pose is good enough for evidence and has stood the shift test."""
+    def add_scan(self, segmented: SegmentedScan, *, busy: bool = False) -> None:
+        """Count the scan's rays, if its pose is good enough for evidence and has stood the shift test; later, if the
+        vehicle is busy with something else that takes long.
+        """
         estimate = segmented.scan.estimate
         pose, most = PoseUncertainty.of(estimate), self._parameters
         if estimate.health != "good" or pose.sigma_m > most.max_sigma_m or pose.sigma_rad > most.max_sigma_rad:
@@ -220,7 +222,7 @@ class Reporter:
         if not most.check_poses:
             self._count(segmented)
             return
-        for one in self._trial.push(segmented):
+        for one in self._trial.push(segmented, busy=busy):
             self._count(one)
         self._hear_trial()
 
