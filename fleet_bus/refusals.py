@@ -53,7 +53,7 @@ def refusals() -> dict[tuple[str, str], int]:
         return dict(_COUNTS)
 
 
-class _Shown:
+class _RefusalsCollector:
     """Collector of the refusals, as prometheus_client asks one."""
 
     def collect(self) -> "Iterator[CounterMetricFamily]":
@@ -72,4 +72,4 @@ class _Shown:
 
 def show_refusals(registry: "CollectorRegistry") -> None:
     """Show them among the metrics of a registry."""
-    registry.register(_Shown())
+    registry.register(_RefusalsCollector())

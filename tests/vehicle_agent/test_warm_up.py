@@ -27,7 +27,8 @@ PROGRAM = textwrap.dedent(
     cold = [
         f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles, fit_kernel)
         for k, v in vars(m).items()
-        if hasattr(v, "signatures") and not k.startswith("_") and k not in INNER and len(v.signatures) != FORMS.get(k, 1)
+        if hasattr(v, "signatures") and not k.startswith("_") and k not in INNER
+        and len(v.signatures) != FORMS.get(k, 1)
     ]
     print(json.dumps({
         "cold": cold, "coders": [k.__name__ for k in USED if len(k.signatures) != 1],
