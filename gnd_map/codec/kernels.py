@@ -17,7 +17,9 @@ from gnd.gnd_map.arrays import I64
 from gnd.gnd_map.jit import bare, bare_inlined
 
 U8 = NDArray[np.uint8]
+Three = tuple[int, int, int]
 Five = tuple[int, int, int, int, int]
+Ends = tuple[int, int, int]  # a decision, and the ends of the interval after it
 State = Any  # (coder, buffer, places, weight): arrays, see `coding.Coder`; a place is probability << 8 | times seen
 
 # Slots of `coder` (int64).
@@ -67,6 +69,7 @@ _STRETCH: Final = _stretch_table().astype(np.int16)
 _STEP: Final = np.array([2 * _ONE // (2 * n + 3) for n in range(256)], np.int64)
 _LIMIT: Final = 250
 _MIX_RATE: Final = 6
+_U0, _U1, _U2, _U3, _U4 = (np.uint64(i) for i in range(5))
 _COST: Final = np.round(-_ONE * np.log2(np.maximum(np.arange(4097), 0.5) / 4096)).astype(np.int64)
 """Bits of a decision, 2^-16, by its probability of 12 bits: for measures only, no byte depends on it."""
 
@@ -96,30 +99,51 @@ def _shift_out(coder: I64, buffer: U8) -> None:
 
 
 @bare_inlined
-def _code(coder: I64, buffer: U8, p: int, bit: int) -> int:
-    """Write `bit`, or read one; `p` of 65536 is the probability of a 1."""
-    span = coder[HIGH] - coder[LOW]
-    middle = coder[LOW] + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
+def _code(coder: I64, buffer: U8, low: int, high: int, p: int, bit: int) -> Ends:
+    """Write `bit`, or read one, in the interval from `low` to `high`; `p` of 65536 is the probability of a 1.
+
+    The interval is the caller's, which keeps it in registers from decision to decision; it lies in `coder` whenever
+    bytes are moved.
+    """
+    span = high - low
+    middle = low + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
     if coder[MODE] == 1:
         bit = 1 if coder[CODE] <= middle else 0
     elif coder[MODE] == 2:
         coder[SPENT + coder[FIELD]] += _COST[(p if bit == 1 else _ONE - p) >> 4]
-    if bit == 1:
-        coder[HIGH] = middle
-    else:
-        coder[LOW] = middle + 1
-    if ((coder[LOW] ^ coder[HIGH]) & 0xFF000000) == 0:
+    low, high = (low, middle) if bit == 1 else (middle + 1, high)
+    if ((low ^ high) & 0xFF000000) == 0:
+        coder[LOW], coder[HIGH] = low, high
         _shift_out(coder, buffer)
-    return bit
+        low, high = coder[LOW], coder[HIGH]
+    return bit, low, high
 
 
 @bare_inlined
 def _learnt(place: int, bit: int) -> int:
     """A context after a decision: its probability moves towards what came, the less the more it has seen."""
     p, n = place >> 8, place & 0xFF
-    p += ((bit << 16) - bit - p) * _STEP[n] >> 16
+    p += ((bit << 16) - bit - p) * _STEP[np.uint64(n)] >> 16
     learnt: int = p << 8 | min(n + 1, _LIMIT)
     return learnt
+
+
+@bare_inlined
+def _stretch(place: int) -> int:
+    """The probability of a context in the logistic domain."""
+    return np.int64(_STRETCH[np.uint64(place >> 12)])  # type: ignore[return-value]  # an int64 to numba
+
+
+@bare_inlined
+def _squash(dot: int) -> int:
+    """Probability of 16 bits by a weighted sum of `_stretch`."""
+    return np.int64(_SQUASH[np.uint64(min(max(dot >> 16, -2047), 2047) + 2048)])  # type: ignore[return-value]
+
+
+@bare_inlined
+def _moved(s: int, error: int) -> int:
+    """By how much the weight of a context with this `_stretch` moves."""
+    return (s * error + 0x80000) >> 20
 
 
 @bare
@@ -127,47 +151,57 @@ def code_bit(state: State, at: int, bit: int) -> int:
     """One decision in one context."""
     coder, buffer, places, _ = state
     place = places[at]
-    bit = _code(coder, buffer, min(max(place >> 8, 6), _ONE - 6), bit)
+    bit, coder[LOW], coder[HIGH] = _code(
+        coder, buffer, coder[LOW], coder[HIGH], min(max(place >> 8, 6), _ONE - 6), bit
+    )
     places[at] = _learnt(place, bit)
     return bit
+
+
+@bare_inlined
+def _mixed(state: State, low: int, high: int, at: Three, w: int, bit: int) -> Ends:
+    """One decision in three contexts, mixed by the weights at `w`, in the interval from `low` to `high`."""
+    coder, buffer, places, weight = state
+    # Indices are never negative: without a sign nothing is spent on those that would be.
+    a, b, c, row = np.uint64(at[0]), np.uint64(at[1]), np.uint64(at[2]), np.uint64(w)
+    pa, pb, pc = np.int64(places[a]), np.int64(places[b]), np.int64(places[c])
+    sa, sb, sc = _stretch(pa), _stretch(pb), _stretch(pc)
+    wa, wb, wc = weight[row, _U0], weight[row, _U1], weight[row, _U2]
+    p = _squash(wa * sa + wb * sb + wc * sc)
+    bit, low, high = _code(coder, buffer, low, high, p, bit)
+    error = ((bit << 16) - p) * _MIX_RATE
+    weight[row, _U0], weight[row, _U1] = wa + _moved(sa, error), wb + _moved(sb, error)
+    weight[row, _U2] = wc + _moved(sc, error)
+    places[a], places[b], places[c] = _learnt(pa, bit), _learnt(pb, bit), _learnt(pc, bit)
+    return bit, low, high
+
+
+@bare_inlined
+def _mixed_5(state: State, low: int, high: int, at: Five, w: int, bit: int) -> Ends:
+    """`_mixed` in five contexts."""
+    coder, buffer, places, weight = state
+    a, b, c, d, e = np.uint64(at[0]), np.uint64(at[1]), np.uint64(at[2]), np.uint64(at[3]), np.uint64(at[4])
+    row = np.uint64(w)
+    pa, pb, pc = np.int64(places[a]), np.int64(places[b]), np.int64(places[c])
+    pd, pe = np.int64(places[d]), np.int64(places[e])
+    sa, sb, sc, sd, se = _stretch(pa), _stretch(pb), _stretch(pc), _stretch(pd), _stretch(pe)
+    wa, wb, wc, wd, we = weight[row, _U0], weight[row, _U1], weight[row, _U2], weight[row, _U3], weight[row, _U4]
+    p = _squash(wa * sa + wb * sb + wc * sc + wd * sd + we * se)
+    bit, low, high = _code(coder, buffer, low, high, p, bit)
+    error = ((bit << 16) - p) * _MIX_RATE
+    weight[row, _U0], weight[row, _U1] = wa + _moved(sa, error), wb + _moved(sb, error)
+    weight[row, _U2], weight[row, _U3] = wc + _moved(sc, error), wd + _moved(sd, error)
+    weight[row, _U4] = we + _moved(se, error)
+    places[a], places[b], places[c] = _learnt(pa, bit), _learnt(pb, bit), _learnt(pc, bit)
+    places[d], places[e] = _learnt(pd, bit), _learnt(pe, bit)
+    return bit, low, high
 
 
 @bare
 def code_mixed(state: State, a: int, b: int, c: int, w: int, bit: int) -> int:
     """One decision in three contexts, mixed by the weights at `w`."""
-    coder, buffer, places, weight = state
-    pa, pb, pc = places[a], places[b], places[c]
-    sa, sb, sc = np.int64(_STRETCH[pa >> 12]), np.int64(_STRETCH[pb >> 12]), np.int64(_STRETCH[pc >> 12])
-    d = (weight[w, 0] * sa + weight[w, 1] * sb + weight[w, 2] * sc) >> 16
-    p = np.int64(_SQUASH[min(max(d, -2047), 2047) + 2048])
-    bit = _code(coder, buffer, p, bit)  # type: ignore[arg-type]  # an int64 to numba
-    error = ((bit << 16) - p) * _MIX_RATE
-    weight[w, 0] += (sa * error + 0x80000) >> 20
-    weight[w, 1] += (sb * error + 0x80000) >> 20
-    weight[w, 2] += (sc * error + 0x80000) >> 20
-    places[a], places[b], places[c] = _learnt(pa, bit), _learnt(pb, bit), _learnt(pc, bit)
-    return bit
-
-
-@bare
-def code_mixed_5(state: State, at: Five, w: int, bit: int) -> int:
-    """One decision in five contexts, mixed by the weights at `w`."""
-    coder, buffer, places, weight = state
-    a, b, c, d, e = at
-    pa, pb, pc, pd, pe = places[a], places[b], places[c], places[d], places[e]
-    sa, sb, sc = np.int64(_STRETCH[pa >> 12]), np.int64(_STRETCH[pb >> 12]), np.int64(_STRETCH[pc >> 12])
-    sd, se = np.int64(_STRETCH[pd >> 12]), np.int64(_STRETCH[pe >> 12])
-    dot = weight[w, 0] * sa + weight[w, 1] * sb + weight[w, 2] * sc + weight[w, 3] * sd + weight[w, 4] * se
-    p = np.int64(_SQUASH[min(max(dot >> 16, -2047), 2047) + 2048])
-    bit = _code(coder, buffer, p, bit)  # type: ignore[arg-type]  # an int64 to numba
-    error = ((bit << 16) - p) * _MIX_RATE
-    weight[w, 0] += (sa * error + 0x80000) >> 20
-    weight[w, 1] += (sb * error + 0x80000) >> 20
-    weight[w, 2] += (sc * error + 0x80000) >> 20
-    weight[w, 3] += (sd * error + 0x80000) >> 20
-    weight[w, 4] += (se * error + 0x80000) >> 20
-    places[a], places[b], places[c] = _learnt(pa, bit), _learnt(pb, bit), _learnt(pc, bit)
-    places[d], places[e] = _learnt(pd, bit), _learnt(pe, bit)
+    coder = state[0]
+    bit, coder[LOW], coder[HIGH] = _mixed(state, coder[LOW], coder[HIGH], (a, b, c), w, bit)
     return bit
 
 
@@ -179,45 +213,60 @@ _LONGEST: Final = 14
 
 
 @bare
-def code_signed(state: State, a: int, b: int, c: int, w: int, value: int) -> int:
+def code_signed(state: State, at: Three, w: int, value: int) -> int:
     """A signed number below 2^14 in three contexts of WIDTH places each; mixing weights from `w` on."""
+    coder = state[0]
+    low, high = coder[LOW], coder[HIGH]
+    a, b, c = at
     size = abs(value)
-    length = 0
-    while (size >> length) > 0:
-        length += 1
     k = 0
-    while k < _LONGEST and code_mixed(state, a + k, b + k, c + k, w + k, 1 if length > k else 0) == 1:
+    while k < _LONGEST:
+        bit, low, high = _mixed(state, low, high, (a + k, b + k, c + k), w + k, 1 if size >> k > 0 else 0)
+        if bit == 0:
+            break
         k += 1
-    if k == 0:
-        return 0
-    sign = code_mixed(state, a + _SIGN, b + _SIGN, c + _SIGN, w + _SIGN, 1 if value < 0 else 0)
-    found = 1
-    for i in range(k - 2, -1, -1):
-        lead = _LEAD + (min(k, 6) - 2 if i == k - 2 else (min(k, 6) + 2 if i == k - 3 else 9))
-        found = found << 1 | code_mixed(state, a + lead, b + lead, c + lead, w + lead, (size >> i) & 1)
-    return -found if sign == 1 else found
+    found = 0
+    if k > 0:
+        i = _SIGN
+        sign, low, high = _mixed(state, low, high, (a + i, b + i, c + i), w + i, 1 if value < 0 else 0)
+        found = 1
+        for j in range(k - 2, -1, -1):
+            i = _LEAD + (min(k, 6) - 2 if j == k - 2 else (min(k, 6) + 2 if j == k - 3 else 9))
+            bit, low, high = _mixed(state, low, high, (a + i, b + i, c + i), w + i, (size >> j) & 1)
+            found = found << 1 | bit
+        found = -found if sign == 1 else found
+    coder[LOW], coder[HIGH] = low, high
+    return found
 
 
 @bare
 def code_signed_5(state: State, at: Five, w: int, value: int) -> int:
     """`code_signed` in five contexts."""
+    coder = state[0]
+    low, high = coder[LOW], coder[HIGH]
     a, b, c, d, e = at
     size = abs(value)
-    length = 0
-    while (size >> length) > 0:
-        length += 1
     k = 0
-    while k < _LONGEST and code_mixed_5(state, (a + k, b + k, c + k, d + k, e + k), w + k, 1 if length > k else 0) == 1:
+    while k < _LONGEST:
+        places = (a + k, b + k, c + k, d + k, e + k)
+        bit, low, high = _mixed_5(state, low, high, places, w + k, 1 if size >> k > 0 else 0)
+        if bit == 0:
+            break
         k += 1
-    if k == 0:
-        return 0
-    i = _SIGN
-    sign = code_mixed_5(state, (a + i, b + i, c + i, d + i, e + i), w + i, 1 if value < 0 else 0)
-    found = 1
-    for j in range(k - 2, -1, -1):
-        i = _LEAD + (min(k, 6) - 2 if j == k - 2 else (min(k, 6) + 2 if j == k - 3 else 9))
-        found = found << 1 | code_mixed_5(state, (a + i, b + i, c + i, d + i, e + i), w + i, (size >> j) & 1)
-    return -found if sign == 1 else found
+    found = 0
+    if k > 0:
+        i = _SIGN
+        places = (a + i, b + i, c + i, d + i, e + i)
+        sign, low, high = _mixed_5(state, low, high, places, w + i, 1 if value < 0 else 0)
+        found = 1
+        for j in range(k - 2, -1, -1):
+            i = _LEAD + (min(k, 6) - 2 if j == k - 2 else (min(k, 6) + 2 if j == k - 3 else 9))
+            places = (a + i, b + i, c + i, d + i, e + i)
+            bit, low, high = _mixed_5(state, low, high, places, w + i, (size >> j) & 1)
+            found = found << 1 | bit
+        found = -found if sign == 1 else found
+    coder[LOW], coder[HIGH] = low, high
+    return found
 
 
 @bare

@@ -23,6 +23,8 @@ MAX_VOLUME: Final = 1 << 22
 """Voxels of the box around a tile's Gaussians: 2,700 floors of 39 x 39."""
 MAX_MESSAGE_VOLUME: Final = 1 << 23
 """Voxels of all boxes of a message: 270 tiles with 20 floors each; reading them takes some 0.2 s."""
+MOST_COUNT: Final = 30
+"""Largest index of a number of points that is coded."""
 MAX_FLOOR: Final = 100_000
 """As `VoxelGrid` has it."""
 _ANY: Final = number_at(0) + 69  # a context of its own in the room of the first number
@@ -200,14 +202,21 @@ def _coding(
     coder: Coder, table: I32, where: I32, lattice: Lattice, grid: VoxelGrid, *, has_base: bool
 ) -> v.VoxelCoding:
     # 1/256 m: coarse enough that no machine's sine rounds it another way
+    top, floor_step, line_step = len(lattice.sd) - 1, where.shape[1] * where.shape[2], where.shape[2]
     pitch = [round(size_m * 256) << (lattice.mean_bits - 8) for size_m in (grid.dx_m, grid.dy_m, grid.dz_m)]
     return v.VoxelCoding(
         coder.state,
         VOXELS_AT,
         VOXEL_WEIGHTS_AT,
         table,
-        where,
-        np.zeros(v.MOST_REFS, np.int64),
+        where.reshape(-1),
+        floor_step,
+        line_step,
+        v.neighbours(floor_step, line_step, only_before=not has_base),
+        np.zeros(1 + v.NEIGHBOURS + 1, np.int64),
+        np.zeros(v.MOST_REFS + 1, np.int64),
+        np.zeros(v.MEMO, np.int64),
+        np.array([top, top // lattice.plane_step, top // lattice.plane_step, MOST_COUNT], np.int64),
         np.array(lattice.sd, np.int64),
         np.array(pitch, np.int64),
         lattice.plane_step,

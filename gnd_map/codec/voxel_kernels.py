@@ -72,10 +72,28 @@ VOXEL_WEIGHTS: Final = 2 + WIDTH * len(_FAMILIES)
 MORE_VOXEL_CONTEXTS: Final = int(_MORE_START[-1])
 MORE_VOXEL_WEIGHTS: Final = 3 * WIDTH * len(_FAMILIES)
 
+# By family: the column that it fills.
+_COLUMN: Final = np.array(
+    [LEVEL + 2, LEVEL, LEVEL + 1, COUNT, SLOPE, SLOPE + 2, SLOPE + 1, STEP, STEP + 1, STEP + 2], np.int64
+)
+NUMBERS: Final = len(_FAMILIES)
+TOPS: Final = _COUNT + 1
+"""Families whose numbers go from 0 to a largest one: the first of them."""
+
 MOST_REFS: Final = 4
 _BITS: Final = 16
 """Of a tilt's fraction."""
 _NO_AXIS: Final = 3
+
+# Slots of `memo` (int64): what the numbers of one voxel tell those after them.
+_ODD: Final = 0  # by family: by how much the number differed from what was expected
+_TILT_A: Final = NUMBERS  # the neighbours' mean
+_TILT_B: Final = NUMBERS + 1
+_DOUBT_A: Final = NUMBERS + 2
+MEMO: Final = NUMBERS + 3
+
+NEIGHBOURS: Final = 26
+_Expected = tuple[int, int, int, int, int, int]  # five contexts of a number, and what it is expected to be
 
 
 class VoxelCoding(NamedTuple):
@@ -87,8 +105,14 @@ class VoxelCoding(NamedTuple):
         w: first mixing weights.
         table: (N, COLUMNS); row 0 holds typical values, the rows before the first that is coded are known to both
             sides, of the others Z, Y, X and SELF are.
-        where: (nz, ny, nx) row of each voxel known so far, -1 elsewhere, -2 where one will come; padded.
-        refs: (MOST_REFS,) int64, room for the rows of neighbours.
+        where: (nz · ny · nx,) row of each voxel known so far, -1 elsewhere, -2 where one will come; padded.
+        floor_step: from a voxel to the one above it in `where`.
+        line_step: to the next one along y.
+        around: (K,) int64 the same to the neighbours that can be known: across faces, then edges, then corners.
+        known: (1 + NEIGHBOURS,) int64, room for the rows of neighbours,
+        refs: (MOST_REFS + 1,) int64, and of those of the same thin axis.
+        memo: (MEMO,) int64, room for what is remembered of a voxel.
+        tops: (TOPS,) int64 largest level c, a, b and count.
         sd: standard deviations of the lattice, 2^-20 m.
         pitch: (3,) size of a voxel along x, y, z, 2^-mean_bits m.
         plane_step: a level along the surface is so many of `sd`.
@@ -107,7 +131,13 @@ class VoxelCoding(NamedTuple):
     w: int
     table: I32
     where: I32
+    floor_step: int
+    line_step: int
+    around: I64
+    known: I64
     refs: I64
+    memo: I64
+    tops: I64
     sd: I64
     pitch: I64
     plane_step: int
@@ -149,118 +179,202 @@ class _Voxel(NamedTuple):
     second: int
 
 
+def neighbours(floor_step: int, line_step: int, *, only_before: bool) -> I64:
+    """(K,) steps in `where` to the neighbours of a voxel: across faces, then edges, then corners; or to those before it
+    in order: where both sides hold nothing, no other can be known.
+    """
+    steps = [(z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) != (0, 0, 0)]
+    steps = sorted(steps, key=lambda step: sum(map(abs, step)))
+    kept = [step for step in steps if step < (0, 0, 0) or not only_before]
+    return np.array([z * floor_step + y * line_step + x for z, y, x in kept], np.int64)
+
+
 @bare
 def code_voxels(m: VoxelCoding, first: int) -> None:
-    """The Gaussians of the rows `first` … of the table, in order."""
+    """The Gaussians of the rows `first` … of the table, in order.
+
+    The ten numbers of a voxel are coded in a loop, not one after the other: so there is one place where a number is
+    coded, and all of it fits the processor's cache of instructions.
+    """
     table = m.table
     for row in range(1, first):
         _keep_tilts(m, row)
     for row in range(first, len(table)):
-        _code_voxel(m, row)
-        m.where[table[row, Z], table[row, Y], table[row, X]] = row
+        place = table[row, Z] * m.floor_step + table[row, Y] * m.line_step + table[row, X]
+        v = _code_axis(m, row, place)
+        for family in range(NUMBERS):
+            _code_number(m, v, family)
+        m.where[np.uint64(place)] = row
         if m.state[0][TROUBLE] != 0:
             return
 
 
 @bare_inlined
-def _code_voxel(m: VoxelCoding, row: int) -> None:
-    """One Gaussian: its thin axis, sizes, slopes and mean."""
-    table = m.table
-    occupied = _occupied(m.where, table[row, Z], table[row, Y], table[row, X])
-    kind = 2 if table[row, SELF] >= 0 else m.has_base
-    axis = table[row, AXIS] = _code_axis(m, row, occupied, kind)
-    n = _neighbours(m, row, axis, MOST_REFS)
-    first = m.refs[0] if n > 0 else 0
+def _code_axis(m: VoxelCoding, row: int, place: int) -> _Voxel:
+    """The axis along which the Gaussian is thinnest, and what is known around it."""
+    table, known, refs = m.table, m.known, m.refs
+    m.state[0][FIELD] = 1
+    own_row, occupied = table[row, SELF], _occupied(m, place)
+    n = _known_around(m, place, own_row)
+    first = table[known[0], AXIS] if n > 0 else _NO_AXIS
+    second = table[known[1], AXIS] if n > 1 else _NO_AXIS
+    kind = 2 if own_row >= 0 else m.has_base
+    own = table[own_row, AXIS] if kind == 2 else _NO_AXIS
+    at = m.at + 2 * (first * 4 + second), m.at + 32 + 2 * occupied, m.at + 160 + 2 * (kind * 4 + own)
+    axis = _axis_in(m, at, table[row, AXIS])
+    table[row, AXIS] = axis
+    same = 0
+    for i in range(n):
+        refs[same] = known[i]
+        same += 1 if table[known[i], AXIS] == axis else 0
+        if same == MOST_REFS:
+            break
+    one = refs[0] if same > 0 else 0
     along_a, along_b = (0 if axis != 0 else 1), (2 if axis != 2 else 1)
-    v = _Voxel(
-        row, kind, axis, n, first, occupied >> (2 * along_a) & 3, occupied >> (2 * along_b) & 3,
-        occupied >> (2 * axis) & 3, occupied, m.refs[1] if n > 1 else first,
+    return _Voxel(
+        row, kind, axis, same, one, occupied >> (2 * along_a) & 3, occupied >> (2 * along_b) & 3,
+        occupied >> (2 * axis) & 3, occupied, refs[1] if same > 1 else one,
     )  # fmt: skip
-    _code_sizes(m, v)
-    odd_a, odd_b = _code_slopes(m, v)
-    _code_mean(m, v, min(_bucket(odd_a), 3) * 4 + min(_bucket(odd_b), 3))
-    _keep_tilts(m, row)
 
 
 @bare_inlined
-def _code_axis(m: VoxelCoding, row: int, occupied: int, kind: int) -> int:
-    """The axis along which the Gaussian is thinnest."""
-    table, refs = m.table, m.refs
-    m.state[0][FIELD] = 1
-    n = _neighbours(m, row, _ANY_AXIS, 2)
-    first = table[refs[0], AXIS] if n > 0 else _NO_AXIS
-    second = table[refs[1], AXIS] if n > 1 else _NO_AXIS
-    own = table[table[row, SELF], AXIS] if kind == 2 else _NO_AXIS
-    a, b, c = m.at + 2 * (first * 4 + second), m.at + 32 + 2 * occupied, m.at + 160 + 2 * (kind * 4 + own)
-    axis = table[row, AXIS]
+def _axis_in(m: VoxelCoding, at: tuple[int, int, int], axis: int) -> int:
+    """Write or read the axis."""
+    a, b, c = at
     if code_mixed(m.state, a, b, c, m.w, 1 if axis == 2 else 0) == 1:
         return 2
     return code_mixed(m.state, a + 1, b + 1, c + 1, m.w + 1, 1 if axis == 1 else 0)
 
 
 @bare_inlined
-def _code_sizes(m: VoxelCoding, v: _Voxel) -> None:
-    """The three levels and the count: of c and the count against the neighbours' mean, of a and b against the first."""
-    table, row, top = m.table, v.row, len(m.sd) - 1
-    mean_c = mean_count = 0
-    low_c, high_c = 99, 0
-    for i in range(v.n):
-        level, count = table[m.refs[i], LEVEL + 2], table[m.refs[i], COUNT]
-        mean_c, mean_count = mean_c + level, mean_count + count
-        low_c, high_c = min(low_c, level), max(high_c, level)
-    mean_c = _ratio(mean_c, v.n) if v.n > 0 else table[0, LEVEL + 2]
-    mean_count = _ratio(mean_count, v.n) if v.n > 0 else table[0, COUNT]
-    known = min(v.n, 3) * 3 + v.kind
-    spread = min(high_c - low_c, 5) if v.n > 1 else 0
-
-    one, two = table[v.first, LEVEL + 2] - mean_c, table[v.second, LEVEL + 2] - mean_c
-    d, e = _two_neighbours(v, one, two), v.occupied * 2 + (v.n > 0)
-    odd_c = _number(
-        m, v, _LEVEL_C, known, _clip(mean_c // 2, 0, 23), spread * 3 + v.axis, d, e, table[row, LEVEL + 2] - mean_c
-    )
-    level_c = table[row, LEVEL + 2] = _clip(mean_c + odd_c, 0, top)
-    level_a = _code_level(m, v, 0, _LEVEL_A, v.around_a, min(level_c // 2, 15))
-    level_b = _code_level(m, v, 1, _LEVEL_B, v.around_b, min(level_a, 15))
-    one, two = table[v.first, COUNT] - mean_count, table[v.second, COUNT] - mean_count
-    d, e = _two_neighbours(v, one, two), v.occupied * 2 + (v.n > 0)
-    odd_count = _number(
-        m, v, _COUNT, known, _clip(mean_count, 0, 23), min(level_a + level_b, 23), d, e, table[row, COUNT] - mean_count
-    )
-    table[row, COUNT] = _clip(mean_count + odd_count, 0, 30)
+def _known_around(m: VoxelCoding, place: int, own_row: int) -> int:
+    """Rows of the known neighbours in `known`, the replaced one first; how many."""
+    known, n = m.known, 0
+    if own_row >= 0:
+        known[0] = own_row
+        n = 1
+    for i in range(len(m.around)):
+        other = m.where[np.uint64(place + m.around[i])]
+        known[np.uint64(n)] = other
+        n += 1 if other >= 0 else 0
+    return n
 
 
 @bare_inlined
-def _code_level(m: VoxelCoding, v: _Voxel, which: int, family: int, around: int, other: int) -> int:
-    """A standard deviation along the surface."""
-    want = m.table[v.first, LEVEL + which]
-    contexts = min(want, 15), (around * 3 + v.axis) * 3 + v.kind, other
-    odd_b = _clip(m.table[v.row, LEVEL] - m.table[v.first, LEVEL], -2, 2) + 2 if which == 1 else 2
-    second = _clip(m.table[v.second, LEVEL + which] - want, -2, 2) + 2
-    d = ((odd_b * 2 + (v.n > 0)) * 4 + around) * 5 + second
-    odd = _number(
-        m, v, family, contexts[0], contexts[1], contexts[2], d, v.occupied, m.table[v.row, LEVEL + which] - want
+def _occupied(m: VoxelCoding, place: int) -> int:
+    """The six neighbours across faces that hold, or will hold, a Gaussian: one bit each."""
+    where, line, floor = m.where, m.line_step, m.floor_step
+    found: int = (
+        (where[np.uint64(place - 1)] != -1)
+        | (where[np.uint64(place + 1)] != -1) << 1
+        | (where[np.uint64(place - line)] != -1) << 2
+        | (where[np.uint64(place + line)] != -1) << 3
+        | (where[np.uint64(place - floor)] != -1) << 4
+        | (where[np.uint64(place + floor)] != -1) << 5
     )
-    found = _clip(want + odd, 0, (len(m.sd) - 1) // m.plane_step)
-    m.table[v.row, LEVEL + which] = found
     return found
 
 
 @bare_inlined
-def _code_slopes(m: VoxelCoding, v: _Voxel) -> tuple[int, int]:
-    """The shear, and the slopes of c against those of a surface with the neighbours' mean tilt,
-    c = tilt_a a + tilt_b b; by how much they differ from it.
-    """
-    table, row = m.table, v.row
-    level_a, level_b, level_c = table[row, LEVEL], table[row, LEVEL + 1], table[row, LEVEL + 2]
-    near_shear = _bucket(table[v.first, SLOPE]) if v.n > 0 else 0
-    d = (_clip(table[v.first, SLOPE], -2, 2) + 2) * 5 + _clip(table[v.second, SLOPE], -2, 2) + 2 if v.n > 0 else 12
-    s_ba = table[row, SLOPE] = _number(
-        m, v, _SHEAR, min(near_shear, 4) * 3 + v.kind, min(level_a, 15), min(level_b, 15), d, v.occupied,
-        table[row, SLOPE],
-    )  # fmt: skip
-    D1, D2, D3 = _diagonal(m, row)
-    L21 = s_ba * D2 >> m.shear_bits
+def _code_number(m: VoxelCoding, v: _Voxel, family: int) -> None:
+    """A number of a family: how far it is from what is expected, in its first three contexts or in all five."""
+    a, b, c, d, e, want = _expected(m, v, family)
+    m.state[0][FIELD] = family + 2
+    column, at = _COLUMN[family], m.at + AXIS_CONTEXTS
+    value = m.table[v.row, column] - want
+    at_a, at_b = at + _START[3 * family] + a * WIDTH, at + _START[3 * family + 1] + b * WIDTH
+    at_c = at + _START[3 * family + 2] + c * WIDTH
+    if m.five == 1:
+        more = m.at + VOXEL_CONTEXTS
+        at_d, at_e = more + _MORE_START[2 * family] + d * WIDTH, more + _MORE_START[2 * family + 1] + e * WIDTH
+        w = m.w + 2 + (min(v.n, 2) * NUMBERS + family) * WIDTH
+        odd = code_signed_5(m.state, (at_a, at_b, at_c, at_d, at_e), w, value)
+    else:
+        odd = code_signed(m.state, (at_a, at_b, at_c), m.w + 2 + family * WIDTH, value)
+    m.memo[_ODD + family] = odd
+    found = want + odd
+    m.table[v.row, column] = _clip(found, 0, m.tops[family]) if family < TOPS else found
 
+
+@bare_inlined
+def _expected(m: VoxelCoding, v: _Voxel, family: int) -> _Expected:
+    """The contexts of a number, and what the neighbours and the voxel's numbers so far let expect."""
+    level = m.table[v.row, LEVEL + 2] // 2 if family == _LEVEL_A else m.table[v.row, LEVEL]
+    if family == _LEVEL_C:
+        return _level_c_expected(m, v)
+    if family == _LEVEL_A:
+        return _level_expected(m, v, 0, v.around_a, min(level, 15))
+    if family == _LEVEL_B:
+        return _level_expected(m, v, 1, v.around_b, min(level, 15))
+    if family == _COUNT:
+        return _count_expected(m, v)
+    if family == _SHEAR:
+        return _shear_expected(m, v)
+    if family == _SLOPE_CB:
+        return _slope_cb_expected(m, v)
+    if family == _SLOPE_CA:
+        return _slope_ca_expected(m, v)
+    if family == _STEP_A:
+        return _step_expected(m, v, 0, v.around_a, m.table[v.row, SLOPE])
+    if family == _STEP_B:
+        return _step_expected(m, v, 1, v.around_b, m.table[v.row, STEP])
+    return _step_c_expected(m, v)
+
+
+@bare_inlined
+def _level_c_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
+    """Level c: the neighbours' mean."""
+    table, mean = m.table, 0
+    low, high = 99, 0
+    for i in range(v.n):
+        level = table[m.refs[i], LEVEL + 2]
+        mean, low, high = mean + level, min(low, level), max(high, level)
+    mean = _ratio(mean, v.n) if v.n > 0 else table[0, LEVEL + 2]
+    spread = min(high - low, 5) if v.n > 1 else 0
+    d = _two_neighbours(v, table[v.first, LEVEL + 2] - mean, table[v.second, LEVEL + 2] - mean)
+    return (
+        min(v.n, 3) * 3 + v.kind, _clip(mean // 2, 0, 23), spread * 3 + v.axis, d, v.occupied * 2 + (v.n > 0), mean
+    )  # fmt: skip
+
+
+@bare_inlined
+def _level_expected(m: VoxelCoding, v: _Voxel, which: int, around: int, other: int) -> _Expected:
+    """A standard deviation along the surface: that of the first neighbour."""
+    table = m.table
+    want = table[v.first, LEVEL + which]
+    odd_a = _clip(table[v.row, LEVEL] - table[v.first, LEVEL], -2, 2) + 2 if which == 1 else 2
+    second = _clip(table[v.second, LEVEL + which] - want, -2, 2) + 2
+    d = ((odd_a * 2 + (v.n > 0)) * 4 + around) * 5 + second
+    return min(want, 15), (around * 3 + v.axis) * 3 + v.kind, other, d, v.occupied, want
+
+
+@bare_inlined
+def _count_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
+    """The count: the neighbours' mean."""
+    table, mean = m.table, 0
+    for i in range(v.n):
+        mean += table[m.refs[i], COUNT]
+    mean = _ratio(mean, v.n) if v.n > 0 else table[0, COUNT]
+    d = _two_neighbours(v, table[v.first, COUNT] - mean, table[v.second, COUNT] - mean)
+    wide = min(table[v.row, LEVEL] + table[v.row, LEVEL + 1], 23)
+    return min(v.n, 3) * 3 + v.kind, _clip(mean, 0, 23), wide, d, v.occupied * 2 + (v.n > 0), mean
+
+
+@bare_inlined
+def _shear_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
+    """The shear: none."""
+    table = m.table
+    one, two = table[v.first, SLOPE], table[v.second, SLOPE]
+    near = min(_bucket(one), 4) if v.n > 0 else 0
+    d = (_clip(one, -2, 2) + 2) * 5 + _clip(two, -2, 2) + 2 if v.n > 0 else 12
+    return near * 3 + v.kind, min(table[v.row, LEVEL], 15), min(table[v.row, LEVEL + 1], 15), d, v.occupied, 0
+
+
+@bare_inlined
+def _slope_cb_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
+    """The slope of c over b: that of a surface with the neighbours' mean tilt, c = tilt_a a + tilt_b b."""
+    table, row = m.table, v.row
+    D1, D2, D3 = _diagonal(m, row)
     tilt_a = tilt_b = 0
     low_a = low_b = 1 << 40
     high_a = high_b = -(1 << 40)
@@ -272,101 +386,78 @@ def _code_slopes(m: VoxelCoding, v: _Voxel) -> tuple[int, int]:
         tilt_a, tilt_b = _ratio(tilt_a, v.n), _ratio(tilt_b, v.n)
     doubt_a = _bucket(_ratio((high_a - low_a) * D1 >> _BITS << m.slope_bits, D3)) if v.n > 1 else 0
     doubt_b = _bucket(_ratio((high_b - low_b) * D2 >> _BITS << m.slope_bits, D3)) if v.n > 1 else 0
-
-    near, thin, turned = min(v.n, 3) * 6, _clip(level_c, 0, 23), (v.kind * 3 + v.axis) * 4
+    m.memo[_TILT_A], m.memo[_TILT_B], m.memo[_DOUBT_A] = tilt_a, tilt_b, doubt_a
     want = _clip(_ratio((tilt_b * D2 >> _BITS) << m.slope_bits, D3), -2000, 2000)
-    first = _clip(_ratio((int(table[v.first, TILT + 1]) * D2 >> _BITS) << m.slope_bits, D3), -2000, 2000) - want
-    d, e = (_clip(first, -6, 6) + 6) * 9 + v.around_b * 2 + (v.n > 1), _sloped(v, want) * 4 + v.around_c
-    odd_b = _number(
-        m, v, _SLOPE_CB, near + doubt_b, thin, turned + min(_bucket(s_ba), 3), d, e, table[row, SLOPE + 2] - want
-    )
-    table[row, SLOPE + 2] = want + odd_b
-    want = _clip(_ratio((tilt_a * D1 + tilt_b * L21 >> _BITS) << m.slope_bits, D3), -2000, 2000)
-    first = _clip(_ratio((int(table[v.first, TILT]) * D1 >> _BITS) << m.slope_bits, D3), -2000, 2000) - want
-    d, e = (_clip(first, -6, 6) + 6) * 9 + v.around_a * 2 + (v.n > 1), _sloped(v, want) * 4 + v.around_c
-    odd_a = _number(
-        m, v, _SLOPE_CA, near + doubt_a, thin, turned + min(_bucket(odd_b), 3), d, e, table[row, SLOPE + 1] - want
-    )
-    table[row, SLOPE + 1] = want + odd_a
-    return odd_a, odd_b
+    return _slope_expected(m, v, want, D2, D3, doubt_b, v.around_b, table[row, SLOPE], TILT + 1)
 
 
 @bare_inlined
-def _code_mean(m: VoxelCoding, v: _Voxel, surprise: int) -> None:
-    """The steps of the mean: of a and b against the Gaussian that is replaced, of c against the height at which the
-    neighbours' planes pass there. `surprise` is by how much the slopes differed from what was expected, 0 … 15.
-    """
-    table, row = m.table, v.row
-    own = v.kind == 2 and v.n > 0 and v.first == table[row, SELF]
-    want_a, want_b = (table[v.first, STEP], table[v.first, STEP + 1]) if own else (0, 0)
-    turn_a = _clip(table[v.first, STEP], -1, 1) + 1 if v.n > 0 else 0
-    turn_b = _clip(table[v.first, STEP + 1], -1, 1) + 1 if v.n > 0 else 0
-    context_a, context_b = (v.around_a * 3 + v.kind) * 3 + v.axis, (v.around_b * 3 + v.kind) * 3 + v.axis
-    near_a = turn_a * 6 + min(_bucket(table[row, SLOPE]), 5)
-    e = (_clip(table[v.first, STEP], -6, 6) + 6) * 4 + v.around_a if v.n > 0 else 24 + v.around_a
-    odd_a = _number(
-        m, v, _STEP_A, context_a, min(table[row, LEVEL], 15), near_a, v.occupied, e, table[row, STEP] - want_a
-    )
-    m_a = table[row, STEP] = want_a + odd_a
-    near_b = turn_b * 6 + min(_bucket(m_a), 5)
-    e = (_clip(table[v.first, STEP + 1], -6, 6) + 6) * 4 + v.around_b if v.n > 0 else 24 + v.around_b
-    odd_b = _number(
-        m, v, _STEP_B, context_b, min(table[row, LEVEL + 1], 15), near_b, v.occupied, e, table[row, STEP + 1] - want_b
-    )
-    m_b = table[row, STEP + 1] = want_b + odd_b
+def _slope_ca_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
+    """The slope of c over a, likewise."""
+    D1, D2, D3 = _diagonal(m, v.row)
+    L21 = m.table[v.row, SLOPE] * D2 >> m.shear_bits
+    tilt_a, tilt_b = m.memo[_TILT_A], m.memo[_TILT_B]
+    want = _clip(_ratio((tilt_a * D1 + tilt_b * L21 >> _BITS) << m.slope_bits, D3), -2000, 2000)
+    return _slope_expected(m, v, want, D1, D3, m.memo[_DOUBT_A], v.around_a, m.memo[_ODD + _SLOPE_CB], TILT)
 
+
+@bare_inlined
+def _slope_expected(
+    m: VoxelCoding, v: _Voxel, want: int, D: int, D3: int, doubt: int, around: int, before: int, tilt: int
+) -> _Expected:
+    """The contexts of a slope that is expected to be `want`; `before` is the number before it, `tilt` a column."""
+    thin, turned = _clip(m.table[v.row, LEVEL + 2], 0, 23), (v.kind * 3 + v.axis) * 4
+    d = e = 0
+    if m.five == 1:
+        first = _clip(_ratio((int(m.table[v.first, tilt]) * D >> _BITS) << m.slope_bits, D3), -2000, 2000) - want
+        d, e = (_clip(first, -6, 6) + 6) * 9 + around * 2 + (v.n > 1), _sloped(v, want) * 4 + v.around_c
+    return min(v.n, 3) * 6 + doubt, thin, turned + min(_bucket(before), 3), d, e, want
+
+
+@bare_inlined
+def _step_expected(m: VoxelCoding, v: _Voxel, which: int, around: int, before: int) -> _Expected:
+    """A step of the mean along the surface: that of the Gaussian that is replaced; `before` is a number before it."""
+    table, row = m.table, v.row
+    step = table[v.first, STEP + which]
+    want = step if v.kind == 2 and v.n > 0 and v.first == table[row, SELF] else 0
+    turn = _clip(step, -1, 1) + 1 if v.n > 0 else 0
+    e = (_clip(step, -6, 6) + 6) * 4 + around if v.n > 0 else 24 + around
+    return (
+        (around * 3 + v.kind) * 3 + v.axis, min(table[row, LEVEL + which], 15), turn * 6 + min(_bucket(before), 5),
+        v.occupied, e, want,
+    )  # fmt: skip
+
+
+@bare_inlined
+def _step_c_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
+    """The mean's step across the surface: the height at which the neighbours' planes pass there."""
+    table, row = m.table, v.row
+    tilt_a, tilt_b = _keep_tilts(m, row)
     D1, D2, D3 = _diagonal(m, row)
     L21, L31, L32 = _below_diagonal(m, row, D2, D3)
     fine = m.mean_bits - m.length_bits
-    ya, yb, quantum = m_a << (fine - m.plane_bits), m_b << (fine - m.plane_bits), D3 << (fine - m.thin_bits)
-    mu_a, mu_b = D1 * ya, L21 * ya + D2 * yb
+    ya, yb = table[row, STEP] << (fine - m.plane_bits), table[row, STEP + 1] << (fine - m.plane_bits)
+    quantum = D3 << (fine - m.thin_bits)
+    mu_a, mu_b, mu_c = D1 * ya, L21 * ya + D2 * yb, L31 * ya + L32 * yb
     height = nearest = smooth = 0
     low, high = 1 << 60, -(1 << 60)
-    own_tilt_b = _clip((L32 << _BITS) // D2, -(4 << _BITS), 4 << _BITS)
-    own_tilt_a = _clip(((L31 << _BITS) - own_tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
     for i in range(v.n):
-        h, s = _height(m, v, m.refs[i], mu_a, mu_b, own_tilt_a, own_tilt_b)
+        h, s = _height(m, v, m.refs[i], mu_a, mu_b, tilt_a, tilt_b)
         height, smooth = height + h, smooth + s
         if i == 0:
             nearest = h
         low, high = min(low, h), max(high, h)
-    want = 0
-    if v.n > 0:
-        want = _clip(_ratio(_ratio(height, v.n) - (L31 * ya + L32 * yb), quantum), -4000, 4000)
+    mean = _ratio(height, v.n) if v.n > 0 else 0
+    want = _clip(_ratio(mean - mu_c, quantum), -4000, 4000) if v.n > 0 else 0
     doubt = _bucket(_ratio(high - low, quantum)) if v.n > 1 else 0
     thin = _clip(table[row, LEVEL + 2], 0, 23)
-    d = (_clip(_ratio(_ratio(smooth, max(v.n, 1)) - _ratio(height, max(v.n, 1)), quantum), -6, 6) + 6) * 12
-    d += min(doubt, 3) * 3 + min(_bucket(_ratio(nearest - _ratio(height, max(v.n, 1)), quantum)), 2)
-    e = (_inside(m, v, want * quantum + (L31 * ya + L32 * yb)) * 4 + v.around_c) * 9 + min(thin // 2, 8)
-    odd_c = _number(
-        m, v, _STEP_C, min(v.n, 3) * 6 + doubt, thin, surprise * 3 + v.kind, d, e, table[row, STEP + 2] - want
-    )
-    table[row, STEP + 2] = want + odd_c
-
-
-@bare_inlined
-def _number(m: VoxelCoding, v: _Voxel, family: int, a: int, b: int, c: int, d: int, e: int, value: int) -> int:
-    """A number of a family in its contexts a, b, c, or in all five."""
-    at = m.at + AXIS_CONTEXTS
-    m.state[0][FIELD] = family + 2
+    d = e = 0
     if m.five == 1:
-        more = m.at + VOXEL_CONTEXTS
-        five = (
-            at + _START[3 * family] + a * WIDTH,
-            at + _START[3 * family + 1] + b * WIDTH,
-            at + _START[3 * family + 2] + c * WIDTH,
-            more + _MORE_START[2 * family] + d * WIDTH,
-            more + _MORE_START[2 * family + 1] + e * WIDTH,
-        )
-        return code_signed_5(m.state, five, m.w + 2 + (min(v.n, 2) * 10 + family) * WIDTH, value)
-    return code_signed(
-        m.state,
-        at + _START[3 * family] + a * WIDTH,
-        at + _START[3 * family + 1] + b * WIDTH,
-        at + _START[3 * family + 2] + c * WIDTH,
-        m.w + 2 + family * WIDTH,
-        value,
-    )
+        d = (_clip(_ratio(_ratio(smooth, max(v.n, 1)) - mean, quantum), -6, 6) + 6) * 12
+        d += min(doubt, 3) * 3 + min(_bucket(_ratio(nearest - mean, quantum)), 2)
+        e = (_inside(m, v, want * quantum + mu_c) * 4 + v.around_c) * 9 + min(thin // 2, 8)
+    odd_a, odd_b = min(_bucket(m.memo[_ODD + _SLOPE_CA]), 3), min(_bucket(m.memo[_ODD + _SLOPE_CB]), 3)
+    return min(v.n, 3) * 6 + doubt, thin, (odd_a * 4 + odd_b) * 3 + v.kind, d, e, want
 
 
 @bare_inlined
@@ -392,13 +483,14 @@ def _below_diagonal(m: VoxelCoding, row: int, D2: int, D3: int) -> tuple[int, in
 
 
 @bare_inlined
-def _keep_tilts(m: VoxelCoding, row: int) -> None:
+def _keep_tilts(m: VoxelCoding, row: int) -> tuple[int, int]:
     """Tilt of a known voxel's surface along a and b, 2^-16, at most 4 either way."""
     D1, D2, D3 = _diagonal(m, row)
     L21, L31, L32 = _below_diagonal(m, row, D2, D3)
     tilt_b = _clip((L32 << _BITS) // D2, -(4 << _BITS), 4 << _BITS)
-    m.table[row, TILT] = _clip(((L31 << _BITS) - tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
-    m.table[row, TILT + 1] = tilt_b
+    tilt_a = _clip(((L31 << _BITS) - tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
+    m.table[row, TILT], m.table[row, TILT + 1] = tilt_a, tilt_b
+    return tilt_a, tilt_b
 
 
 @bare_inlined
@@ -447,51 +539,7 @@ def _sloped(v: _Voxel, want: int) -> int:
     return _clip(want, -4, 4) + 4 + 9 * (0 if v.n == 0 else (1 if v.n < 3 else 2))
 
 
-def _around() -> I64:
-    """(26, 3) steps to the neighbours across faces, then edges, then corners."""
-    steps = [(z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) != (0, 0, 0)]
-    return np.array(sorted(steps, key=lambda step: sum(map(abs, step))), np.int64)
-
-
-_AROUND: Final = _around()
-_ANY_AXIS: Final = -1
-
-
-@bare
-def _neighbours(m: VoxelCoding, row: int, axis: int, most: int) -> int:
-    """Rows of up to `most` known neighbours of one thin axis (or any) in `refs`, the replaced one first; how many."""
-    table, where, refs = m.table, m.where, m.refs
-    n = 0
-    own = table[row, SELF]
-    if own >= 0 and (axis == _ANY_AXIS or table[own, AXIS] == axis):
-        refs[0] = own
-        n = 1
-    z, y, x = table[row, Z], table[row, Y], table[row, X]
-    for i in range(26):
-        other = where[z + _AROUND[i, 0], y + _AROUND[i, 1], x + _AROUND[i, 2]]
-        if other >= 0 and (axis == _ANY_AXIS or table[other, AXIS] == axis):
-            refs[n] = other
-            n += 1
-            if n >= most:
-                break
-    return n
-
-
-@bare
-def _occupied(where: I32, z: int, y: int, x: int) -> int:
-    """The six neighbours across faces that hold, or will hold, a Gaussian: one bit each."""
-    found: int = (
-        (where[z, y, x - 1] != -1)
-        | (where[z, y, x + 1] != -1) << 1
-        | (where[z, y - 1, x] != -1) << 2
-        | (where[z, y + 1, x] != -1) << 3
-        | (where[z - 1, y, x] != -1) << 4
-        | (where[z + 1, y, x] != -1) << 5
-    )
-    return found
-
-
-@bare
+@bare_inlined
 def _bucket(value: int) -> int:
     """0, 1, 2-3, 4-7, 8-15, more: 0 … 5."""
     size = abs(value)
@@ -502,12 +550,12 @@ def _bucket(value: int) -> int:
     return k
 
 
-@bare
+@bare_inlined
 def _ratio(numerator: int, denominator: int) -> int:
     """Nearest integer of a quotient, denominator > 0."""
     return (2 * numerator + denominator) // (2 * denominator)
 
 
-@bare
+@bare_inlined
 def _clip(value: int, low: int, high: int) -> int:
     return min(max(value, low), high)
