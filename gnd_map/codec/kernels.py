@@ -64,9 +64,9 @@ def _stretch_table() -> I64:
     return np.asarray(np.minimum(np.searchsorted(_squash_table(), (np.arange(4096) << 4) + 8), 4096) - 2048, np.int64)
 
 
-_SQUASH: Final = _squash_table().astype(np.int32)
+_SQUASH: Final = _squash_table().astype(np.uint16)
 _STRETCH: Final = _stretch_table().astype(np.int16)
-_STEP: Final = np.array([2 * _ONE // (2 * n + 3) for n in range(256)], np.int64)
+_STEP: Final = np.array([2 * _ONE // (2 * n + 3) for n in range(256)], np.int32)
 _LIMIT: Final = 250
 _MIX_RATE: Final = 6
 _U0, _U1, _U2, _U3, _U4 = (np.uint64(i) for i in range(5))
@@ -319,14 +319,15 @@ KIND_CONTEXTS: Final = 16
 
 
 @bare
-def code_flags(state: State, held: U8, flag: U8, mark: U8, at: int, w: int) -> int:
+def code_flags(state: State, held: U8, flag: U8, mark: U8, size: Three, at: int, w: int) -> int:
     """What becomes of each voxel; blocks of 4 x 4 x 4 without a flag cost one decision.
 
     Args:
         state: coder and contexts.
-        held: (nz + 4, ny + 4, nx + 4) 1 where both sides hold a Gaussian; padded by EDGE.
+        held: ((nz + 4) · (ny + 4) · (nx + 4),) 1 where both sides hold a Gaussian; padded by EDGE.
         flag: as `held`, the flags to write, or zeros to read into.
         mark: (nz', ny', nx') blocks, padded by 1; room to work in.
+        size: nz, ny, nx.
         at: first context: BLOCK_CONTEXTS, CELL_CONTEXTS, KIND_CONTEXTS follow.
         w: first mixing weights: 8.
 
@@ -334,28 +335,19 @@ def code_flags(state: State, held: U8, flag: U8, mark: U8, at: int, w: int) -> i
         How many voxels are flagged.
     """
     some = 0
-    for z in range(EDGE, held.shape[0] - EDGE):
-        for y in range(EDGE, held.shape[1] - EDGE):
-            for x in range(EDGE, held.shape[2] - EDGE):
-                some |= held[z, y, x]
-    _code_blocks(state, held, flag, mark, at, some)
-    return _code_cells(state, held, flag, mark, at + BLOCK_CONTEXTS, w, some)
+    for i in range(len(held)):
+        some |= held[i]
+    _code_blocks(state, held, flag, mark, size, at, some)
+    return _code_cells(state, held, flag, mark, size, at + BLOCK_CONTEXTS, w, some)
 
 
-@bare
-def _code_blocks(state: State, held: U8, flag: U8, mark: U8, at: int, some: int) -> None:
+@bare_inlined
+def _code_blocks(state: State, held: U8, flag: U8, mark: U8, size: Three, at: int, some: int) -> None:
     """Which blocks hold a flag."""
     for bz in range(1, mark.shape[0] - 1):
         for by in range(1, mark.shape[1] - 1):
             for bx in range(1, mark.shape[2] - 1):
-                known = any_flag = 0
-                z0, y0, x0 = EDGE + (bz - 1) * BLOCK, EDGE + (by - 1) * BLOCK, EDGE + (bx - 1) * BLOCK
-                for z in range(z0, min(z0 + BLOCK, held.shape[0] - EDGE)):
-                    for y in range(y0, min(y0 + BLOCK, held.shape[1] - EDGE)):
-                        for x in range(x0, min(x0 + BLOCK, held.shape[2] - EDGE)):
-                            known += held[z, y, x]
-                            if flag[z, y, x] != NONE:
-                                any_flag = 1
+                known, any_flag = _in_block(held, flag, size, (bz - 1) * BLOCK, (by - 1) * BLOCK, (bx - 1) * BLOCK)
                 near = mark[bz, by, bx - 1] + mark[bz, by - 1, bx] + mark[bz - 1, by, bx] + mark[bz, by - 1, bx + 1]
                 level = 0 if known == 0 else (1 if known < 4 else (2 if known < 12 else 3))
                 mark[bz, by, bx] = code_bit(state, at + (near * 4 + level) * 2 + some, any_flag)
@@ -363,114 +355,130 @@ def _code_blocks(state: State, held: U8, flag: U8, mark: U8, at: int, some: int)
             return
 
 
-@bare
-def _code_cells(state: State, held: U8, flag: U8, mark: U8, at: int, w: int, some: int) -> int:
+@bare_inlined
+def _in_block(held: U8, flag: U8, size: Three, z0: int, y0: int, x0: int) -> tuple[int, int]:
+    """How many voxels of a block are held, and whether one is flagged, 1 or 0."""
+    line, floor = _steps(size)
+    known = flags = 0
+    for z in range(z0, min(z0 + BLOCK, size[0])):
+        for y in range(y0, min(y0 + BLOCK, size[1])):
+            start = (z + EDGE) * floor + (y + EDGE) * line + EDGE
+            for i in range(start + x0, start + min(x0 + BLOCK, size[2])):
+                known += held[np.uint64(i)]
+                flags |= flag[np.uint64(i)]
+    return known, 1 if flags != NONE else 0
+
+
+@bare_inlined
+def _steps(size: Three) -> tuple[int, int]:
+    """From a voxel to the next one along y, and to the one above it."""
+    line = size[2] + 2 * EDGE
+    return line, line * (size[1] + 2 * EDGE)
+
+
+@bare_inlined
+def _code_cells(state: State, held: U8, flag: U8, mark: U8, size: Three, at: int, w: int, some: int) -> int:
     """The voxels of marked blocks in raster order."""
     count = 0
-    kinds = at + CELL_CONTEXTS
-    for z in range(EDGE, held.shape[0] - EDGE):
-        for y in range(EDGE, held.shape[1] - EDGE):
-            for x in range(EDGE, held.shape[2] - EDGE):
-                if mark[1 + (z - EDGE) // BLOCK, 1 + (y - EDGE) // BLOCK, 1 + (x - EDGE) // BLOCK] == 0:
+    line, floor = _steps(size)
+    for z in range(size[0]):
+        for y in range(size[1]):
+            for bx in range(1, mark.shape[2] - 1):
+                if mark[np.uint64(1 + z // BLOCK), np.uint64(1 + y // BLOCK), np.uint64(bx)] == 0:
                     continue
-                own = held[z, y, x]
-                a, b, c = _cell_contexts(held, flag, mark, z, y, x, some)
-                is_flag = code_mixed(
-                    state, at + a, at + CELL_A + b, at + CELL_A + CELL_B + c, w + some * 4 + own,
-                    1 if flag[z, y, x] != NONE else 0,
-                )  # fmt: skip
-                if is_flag == 0:
-                    continue
-                count += 1
-                if own == 0:
-                    flag[z, y, x] = PUT
-                    continue
-                gone = (flag[z, y, x - 1] == GONE) + (flag[z, y - 1, x] == GONE) + (flag[z - 1, y, x] == GONE)
-                other = (
-                    (flag[z, y, x - 1] == REPLACED) + (flag[z, y - 1, x] == REPLACED) + (flag[z - 1, y, x] == REPLACED)
-                )
-                is_gone = code_bit(state, kinds + gone * 4 + other, 1 if flag[z, y, x] == GONE else 0)
-                flag[z, y, x] = GONE if is_gone == 1 else REPLACED
+                for x in range((bx - 1) * BLOCK, min(bx * BLOCK, size[2])):
+                    i = (z + EDGE) * floor + (y + EDGE) * line + x + EDGE
+                    c = _block_context(mark, z, y, x) << 1 | some
+                    count += _code_cell(state, held, flag, i, (line, floor), at, w, c)
         if state[0][TROUBLE] != 0:
             return count
     return count
 
 
-@bare
-def _cell_contexts(held: U8, flag: U8, mark: U8, z: int, y: int, x: int, some: int) -> tuple[int, int, int]:
+@bare_inlined
+def _block_context(mark: U8, z: int, y: int, x: int) -> int:
+    """Whether the blocks are marked in which the next voxel along x lies, and the one above: two bits."""
+    bz, by, bx = np.uint64(1 + z // BLOCK), np.uint64(1 + y // BLOCK), np.uint64(1 + x // BLOCK)
+    return mark[bz, by, np.uint64(1 + (x + 1) // BLOCK)] + 2 * mark[np.uint64(1 + (z + 1) // BLOCK), by, bx]
+
+
+@bare_inlined
+def _code_cell(
+    state: State, held: U8, flag: U8, i: int, steps: tuple[int, int], at: int, w: int, around: int
+) -> int:
+    """One voxel, the one at `i`; 1 where it is flagged. `around` is `_block_context` and whether anything is held."""
+    some = around & 1
+    a, b, c = _cell_contexts(held, flag, i, steps, some)
+    own, now = np.int64(held[np.uint64(i)]), np.int64(flag[np.uint64(i)])
+    a, b, c = at + a, at + CELL_A + b, at + CELL_A + CELL_B + (c << 3 | around)
+    if code_mixed(state, a, b, c, w + some * 4 + own, 1 if now != NONE else 0) == 0:
+        return 0
+    if own == 0:
+        flag[np.uint64(i)] = PUT
+        return 1
+    line, floor = steps
+    x, y, z = flag[np.uint64(i - 1)], flag[np.uint64(i - line)], flag[np.uint64(i - floor)]
+    gone, other = (x == GONE) + (y == GONE) + (z == GONE), (x == REPLACED) + (y == REPLACED) + (z == REPLACED)
+    is_gone = code_bit(state, at + CELL_CONTEXTS + gone * 4 + other, 1 if now == GONE else 0)
+    flag[np.uint64(i)] = GONE if is_gone == 1 else REPLACED
+    return 1
+
+
+@bare_inlined
+def _cell_contexts(held: U8, flag: U8, i: int, steps: tuple[int, int], some: int) -> tuple[int, int, int]:
     """Three contexts of a voxel: flags that are known already, what is held around it, how many of both."""
-    a = b = 0
-    near = 0
+    line, floor = steps
+    here, below = _line_bits(flag, i), _line_bits(flag, i - floor)
+    before, under = _line_bits(flag, i - line), _line_bits(flag, i - floor - line)
+    past = _line_bits(flag, i - floor + line)
+    near = (here & 1) + _ones(before) + _ones(below) + _ones(under) + _ones(past)
     if some == 0:
-        a = _pattern(flag, z, y, x)
-        b = _far_pattern(flag, z, y, x)
-    else:
-        a = (flag[z, y, x - 1] << 4) | (flag[z, y - 1, x] << 2) | flag[z - 1, y, x]
-        a = 1024 + (
-            (a << 3) | ((flag[z, y - 1, x + 1] != NONE) << 2) | ((flag[z - 1, y, x + 1] != NONE) << 1) | held[z, y, x]
-        )
-        b = 256 | (_held_pattern(held, z, y, x) << 2) | (held[z, y, x] << 1)
-        b |= flag[z, y, x - 1] != NONE or flag[z, y - 1, x] != NONE or flag[z - 1, y, x] != NONE
-    for dz in range(-1, 1):
-        for dy in range(-1, 2):
-            for dx in range(-1, 2):
-                if dz < 0 or dy < 0 or (dy == 0 and dx < 0):
-                    near += flag[z + dz, y + dy, x + dx] != NONE
+        far = (
+            _is_flag(flag, i - 2) | _is_flag(flag, i - 2 * line) << 1 | _is_flag(flag, i - 2 * floor) << 2
+        )  # fmt: skip
+        nearest = here & 1 | before & 2 | (below & 2) << 1
+        a = nearest | (before & 1) << 3 | (before & 4) << 2 | (below & 1) << 5 | (below & 4) << 4
+        a |= (under & 2) << 6 | (past & 2) << 7 | (far & 1) << 9
+        b = nearest | far << 3 | (past & 4) << 4 | (under & 1) << 7
+        return a, b, min(near, 7) * 4
+    own = np.int64(held[np.uint64(i)])
+    x, y, z = flag[np.uint64(i - 1)], flag[np.uint64(i - line)], flag[np.uint64(i - floor)]
+    a = (np.int64(x) << 4 | np.int64(y) << 2 | np.int64(z)) << 3 | before & 4 | (below & 4) >> 1 | own
+    b = 256 | _held_pattern(held, i, steps) << 2 | own << 1 | (1 if x != NONE or y != NONE or z != NONE else 0)
     up = 0
     for dy in range(-1, 2):
         for dx in range(-1, 2):
-            up += held[z + 1, y + dy, x + dx] + held[z, y + dy, x + dx]
-    blocks = (
-        mark[1 + (z - EDGE) // BLOCK, 1 + (y - EDGE) // BLOCK, 1 + (x - EDGE + 1) // BLOCK]
-        + 2 * mark[1 + (z - EDGE + 1) // BLOCK, 1 + (y - EDGE) // BLOCK, 1 + (x - EDGE) // BLOCK]
-    )
-    c = ((min(near, 7) * 4 + (0 if up == 0 else (1 if up < 4 else (2 if up < 9 else 3)))) << 3) | (blocks << 1) | some
-    return a, b, c
+            up += np.int64(held[np.uint64(i + dy * line + dx)]) + held[np.uint64(i + floor + dy * line + dx)]
+    return 1024 + a, b, min(near, 7) * 4 + (0 if up == 0 else (1 if up < 4 else (2 if up < 9 else 3)))
 
 
-@bare
-def _pattern(flag: U8, z: int, y: int, x: int) -> int:
-    """Ten neighbours that come before: one bit each."""
-    found: int = (
-        (flag[z, y, x - 1] != NONE)
-        | (flag[z, y - 1, x] != NONE) << 1
-        | (flag[z - 1, y, x] != NONE) << 2
-        | (flag[z, y - 1, x - 1] != NONE) << 3
-        | (flag[z, y - 1, x + 1] != NONE) << 4
-        | (flag[z - 1, y, x - 1] != NONE) << 5
-        | (flag[z - 1, y, x + 1] != NONE) << 6
-        | (flag[z - 1, y - 1, x] != NONE) << 7
-        | (flag[z - 1, y + 1, x] != NONE) << 8
-        | (flag[z, y, x - 2] != NONE) << 9
-    )
-    return found
+@bare_inlined
+def _is_flag(flag: U8, i: int) -> int:
+    return 1 if flag[np.uint64(i)] != NONE else 0
 
 
-@bare
-def _far_pattern(flag: U8, z: int, y: int, x: int) -> int:
-    """Six neighbours in line, two deep, and two across the floor below."""
-    found: int = (
-        (flag[z, y, x - 1] != NONE)
-        | (flag[z, y - 1, x] != NONE) << 1
-        | (flag[z - 1, y, x] != NONE) << 2
-        | (flag[z, y, x - 2] != NONE) << 3
-        | (flag[z, y - 2, x] != NONE) << 4
-        | (flag[z - 2, y, x] != NONE) << 5
-        | (flag[z - 1, y + 1, x + 1] != NONE) << 6
-        | (flag[z - 1, y - 1, x - 1] != NONE) << 7
-    )
-    return found
+@bare_inlined
+def _line_bits(flag: U8, i: int) -> int:
+    """Of a voxel and the two beside it along x, whether they are flagged: one bit each."""
+    return _is_flag(flag, i - 1) | _is_flag(flag, i) << 1 | _is_flag(flag, i + 1) << 2
 
 
-@bare
-def _held_pattern(held: U8, z: int, y: int, x: int) -> int:
+@bare_inlined
+def _ones(bits: int) -> int:
+    """How many of three bits are set."""
+    return (bits & 1) + (bits >> 1 & 1) + (bits >> 2)
+
+
+@bare_inlined
+def _held_pattern(held: U8, i: int, steps: tuple[int, int]) -> int:
     """The six neighbours across faces: one bit each."""
+    line, floor = steps
     found: int = (
-        held[z, y, x - 1]
-        | held[z, y, x + 1] << 1
-        | held[z, y - 1, x] << 2
-        | held[z, y + 1, x] << 3
-        | held[z - 1, y, x] << 4
-        | held[z + 1, y, x] << 5
+        held[np.uint64(i - 1)]
+        | held[np.uint64(i + 1)] << 1
+        | held[np.uint64(i - line)] << 2
+        | held[np.uint64(i + line)] << 3
+        | held[np.uint64(i - floor)] << 4
+        | held[np.uint64(i + floor)] << 5
     )
     return found

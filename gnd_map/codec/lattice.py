@@ -166,13 +166,12 @@ def dequantise(quantised: Quantised, lattice: Lattice) -> Gaussians:
         CodecError: a column leaves its range, or the values are no Gaussians (means beyond 2 m ...).
     """
     quantised.check(lattice)
-    longest = int((~_is_short(quantised, lattice)).sum())
-    if longest:
-        raise CodecError(f"lattice {lattice.name}: {longest} of {len(quantised)} Gaussians reach {MAX_LENGTH_M} m")
     rows, (n, counts, _) = len(quantised), _numbers(lattice)
     mean_m, cov_m2 = np.empty((rows, 3), np.float32), np.empty((rows, 6), np.float32)
     _, axis, level, slope, step, number = (np.ascontiguousarray(getattr(quantised, f.name)) for f in fields(quantised))
-    k.floats_of(axis, level, slope, step, *_tables(lattice)[2:], n, mean_m, cov_m2)
+    long = int(k.floats_of(axis, level, slope, step, *_tables(lattice)[2:], n, mean_m, cov_m2))
+    if long:
+        raise CodecError(f"lattice {lattice.name}: {long} of {len(quantised)} Gaussians reach {MAX_LENGTH_M} m")
     count = counts[number].astype(np.int32)
     try:
         return Gaussians(quantised.voxel_id, count, np.minimum(count, CELLS).astype(np.int32), mean_m, cov_m2)

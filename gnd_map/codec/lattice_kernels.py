@@ -70,10 +70,12 @@ def to_floats(
 @bare
 def floats_of(
     axis: I32, level: I32, slope: I32, step: I32, along: I64, across: I64, n: I64, mean: F32, cov: F32
-) -> None:
-    """Means (N, 3) and covariances (N, 6) of rows of integers, none of them too long."""
+) -> int:
+    """Means (N, 3) and covariances (N, 6) of rows of integers; how many of them are too long, and left out."""
+    long = 0
     for row in range(len(axis)):
-        to_floats(axis, level, slope, step, along, across, n, row, mean, cov, row)
+        long += 0 if to_floats(axis, level, slope, step, along, across, n, row, mean, cov, row) else 1
+    return long
 
 
 @bare

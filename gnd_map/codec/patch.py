@@ -14,11 +14,10 @@ from gnd.gnd_map.codec.coding import Coder
 from gnd.gnd_map.codec.floats import check_number, decode_gaussians, encode_gaussians
 from gnd.gnd_map.codec.lattice import LATTICES, REPORT, Lattice, dequantise, integers_of, is_on, lattice_with
 from gnd.gnd_map.codec.priors import mask_at, number_at, priors_of
-from gnd.gnd_map.codec.volume import Box, KnownVolume, code_box, code_flags, code_voxels, floors_of, known_of
+from gnd.gnd_map.codec.volume import Box, KnownVolume, box_of, code_box, code_flags, code_voxels, known_of
 from gnd.gnd_map.delta import TileDelta, apply, diff
 from gnd.gnd_map.errors import CodecError, ShapeError
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile_id import TileId
 
 U8 = npt.NDArray[np.uint8]
@@ -187,9 +186,7 @@ def _read_measured(coder: Coder, tile_id: TileId, base: Gaussians, voxel_id: I32
 def _around(tile_id: TileId, base: Gaussians, voxel_id: I32) -> tuple[Box, I32, KnownVolume]:
     """Box, voxels and what is known around them."""
     both = unique(np.concatenate([base.voxel_id, voxel_id]))
-    low, high = floors_of(tile_id, both)
-    box = Box(VoxelGrid.of(tile_id), low, high - low + 1)
-    return box, voxel_id, _known(base, voxel_id, np.empty(0, np.int32), REPORT)
+    return box_of(tile_id, both), voxel_id, _known(base, voxel_id, np.empty(0, np.int32), REPORT)
 
 
 def encode_tiles(entries: Sequence[tuple[int, int]]) -> bytes:

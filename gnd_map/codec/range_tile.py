@@ -15,7 +15,7 @@ from gnd.gnd_map.codec.floats import check_number
 from gnd.gnd_map.codec.lattice import Lattice, Quantised, dequantise, integers_of
 from gnd.gnd_map.codec.prior_sets import sets_of
 from gnd.gnd_map.codec.priors import Priors, priors_of
-from gnd.gnd_map.codec.volume import NOTHING_KNOWN, code_box, code_flags, code_voxels
+from gnd.gnd_map.codec.volume import NOTHING_KNOWN, LaidOut, box_of, code_box, code_flags, code_voxels
 from gnd.gnd_map.errors import CodecError
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
@@ -77,8 +77,10 @@ def _best_set(tile_id: TileId, quantised: Quantised, lattice: Lattice) -> int:
     """The set by which a part of the tile becomes shortest; the first of equals."""
     part = quantised.take(_spread(tile_id, quantised)) if len(quantised) > _TRIED + _TRIED // 2 else quantised
     sets = sets_of(lattice.name)
-    sizes = [len(written(tile_id, part, lattice, one, five=True).finish()) for one in sets] if len(part) else [0]
-    return int(np.argmin(sizes))
+    if not len(part):
+        return 0
+    laid_out = _laid_out(tile_id, part, lattice)
+    return int(np.argmin([len(_written(laid_out, one, five=True).finish()) for one in sets]))
 
 
 def _spread(tile_id: TileId, quantised: Quantised) -> npt.NDArray[np.bool_]:
@@ -98,14 +100,29 @@ def written(
     tile_id: TileId, quantised: Quantised, lattice: Lattice, priors: Priors, *, five: bool, counting: bool = False
 ) -> Coder:
     """The stream of a tile, written by these tables; `counting`: what each field takes, too."""
-    coder = Coder.writing(priors, 4096 + 48 * len(quantised), five=five)
+    if len(quantised):
+        return _written(_laid_out(tile_id, quantised, lattice), priors, five=five, counting=counting)
+    coder = Coder.writing(priors, 4096, five=five)
+    code_box(coder, tile_id, _NOTHING, quantised.voxel_id)
+    return coder
+
+
+def _laid_out(tile_id: TileId, quantised: Quantised, lattice: Lattice) -> LaidOut:
+    """A tile's Gaussians, at least one, as they are written."""
+    box = box_of(tile_id, quantised.voxel_id)
+    return LaidOut.of(box, quantised.voxel_id, NOTHING_KNOWN, lattice, quantised)
+
+
+def _written(laid_out: LaidOut, priors: Priors, *, five: bool, counting: bool = False) -> Coder:
+    """`written` of what has been laid out."""
+    coder = Coder.writing(priors, 4096 + 48 * len(laid_out.voxel_id), five=five)
     coder.state[0][k.MODE] = 2 if counting else 0
-    box = code_box(coder, tile_id, _NOTHING, quantised.voxel_id)
-    if box is not None:
-        flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
-        flag[box.places(quantised.voxel_id)] = k.PUT
-        code_flags(coder, box, _NOTHING, flag)
-        code_voxels(coder, box, quantised.voxel_id, NOTHING_KNOWN, lattice, quantised)
+    box = laid_out.box
+    code_box(coder, box.grid.tile, _NOTHING, laid_out.voxel_id)
+    flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
+    flag[laid_out.places] = k.PUT
+    code_flags(coder, box, _NOTHING, flag)
+    laid_out.code(coder)
     return coder
 
 

@@ -1,6 +1,7 @@
 """Voxels of a tile as arrays around them, as the kernels take them."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -78,6 +79,12 @@ def floors_of(tile_id: TileId, voxel_id: I32) -> tuple[int, int]:
     return int(floor[0]), int(floor[1])
 
 
+def box_of(tile_id: TileId, voxel_id: I32) -> Box:
+    """The box around some voxels (at least one), ascending."""
+    low, high = floors_of(tile_id, voxel_id)
+    return Box(VoxelGrid.of(tile_id), low, high - low + 1)
+
+
 def code_box(coder: Coder, tile_id: TileId, held: I32, flagged: I32 | None) -> Box | None:
     """Write or read the floors between which the held and the flagged voxels lie; None: nothing is flagged.
 
@@ -110,8 +117,10 @@ def code_box(coder: Coder, tile_id: TileId, held: I32, flagged: I32 | None) -> B
 def code_flags(coder: Coder, box: Box, held: I32, flag: U8) -> int:
     """Write the flags of a box's voxels or read them into `flag`; how many."""
     known = np.asarray(box.empty(np.uint8, 0), np.uint8)
-    known[box.places(held)] = 1
-    n = int(k.code_flags(coder.state, known, flag, box.marks(), FLAGS_AT, 0))
+    if len(held):
+        known[box.places(held)] = 1
+    size = box.floors, box.grid.ny, box.grid.nx
+    n = int(k.code_flags(coder.state, known.reshape(-1), flag.reshape(-1), box.marks(), size, FLAGS_AT, 0))
     coder.check()
     return n
 
@@ -142,52 +151,97 @@ NOTHING_KNOWN: Final = KnownVolume(
 )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LaidOut:
+    """The Gaussians of some voxels of a box as the kernel takes them; once laid out, they are written any number of
+    times.
+
+    Attributes:
+        box: in which they lie.
+        lattice: of their integers.
+        voxel_id: (N,) of those that are coded.
+        places: of these.
+        table: (1 + K + N, COLUMNS) see `VoxelCoding`.
+        where: (floors + 4, ny + 4, nx + 4) likewise.
+    """
+
+    box: Box
+    lattice: Lattice
+    voxel_id: I32
+    places: tuple[I64, I64, I64]
+    table: I32
+    where: I32
+
+    @classmethod
+    def of(
+        cls, box: Box, voxel_id: I32, known: KnownVolume, lattice: Lattice, quantised: Quantised | None
+    ) -> "LaidOut":
+        """Those of these voxels, to be written; to be read where `quantised` is None."""
+        n_known, places = len(known.quantised), box.places(voxel_id)
+        table = np.zeros((1 + n_known + len(voxel_id), v.COLUMNS), np.int32)
+        where = np.asarray(box.empty(np.int32, -1), np.int32)
+        table[0] = _typical(lattice)
+        new = table[1 + n_known :]
+        new[:, v.SELF] = -1
+        if n_known:
+            known_places = box.places(known.quantised.voxel_id)
+            _fill_places(table[1 : 1 + n_known], known_places)
+            _fill(table[1 : 1 + n_known], known.quantised)
+            where[known_places] = np.arange(1, 1 + n_known)
+            new[:, v.SELF] = where[places]
+            where[tuple(one[known.replaced] for one in known_places)] = -2
+        _fill_places(new, places)
+        if quantised is not None:
+            _fill(new, quantised)
+        return cls(box, lattice, voxel_id, places, table, where)
+
+    @property
+    def n_known(self) -> int:
+        """K: how many both sides hold."""
+        return len(self.table) - len(self.voxel_id) - 1
+
+    def code(self, coder: Coder) -> None:
+        """Write them, or read them into the table."""
+        self.where[self.places] = -2
+        v.code_voxels(_coding(coder, self), 1 + self.n_known)
+        coder.check()
+
+    def read(self) -> Quantised:
+        """What stands in the table."""
+        rows = self.table[1 + self.n_known :]
+        columns = (
+            rows[:, v.AXIS],
+            rows[:, v.LEVEL : v.LEVEL + 3],
+            rows[:, v.SLOPE : v.SLOPE + 3],
+            rows[:, v.STEP : v.STEP + 3],
+            rows[:, v.COUNT],
+        )
+        return Quantised(self.voxel_id, *map(np.ascontiguousarray, columns))
+
+
 def code_voxels(
     coder: Coder, box: Box, voxel_id: I32, known: KnownVolume, lattice: Lattice, quantised: Quantised | None
 ) -> Quantised:
     """Write the Gaussians of these voxels, or read them (`quantised` None)."""
-    n_known = len(known.quantised)
-    table = np.zeros((1 + n_known + len(voxel_id), v.COLUMNS), np.int32)
-    where = np.asarray(box.empty(np.int32, -1), np.int32)
-    table[0] = _typical(lattice)
-    _fill(table[1 : 1 + n_known], box, known.quantised)
-    where[box.places(known.quantised.voxel_id)] = np.arange(1, 1 + n_known)
-    places = box.places(voxel_id)
-    new = table[1 + n_known :]
-    new[:, v.SELF] = where[places]
-    new[:, v.Z], new[:, v.Y], new[:, v.X] = places
-    where[box.places(known.quantised.voxel_id[known.replaced])] = -2
-    where[places] = -2
-    if quantised is not None:
-        _fill(new, box, quantised, keep_self=True)
-    v.code_voxels(_coding(coder, table, where, lattice, box.grid, has_base=n_known > 0), 1 + n_known)
-    coder.check()
-    return _read(new, voxel_id)
+    laid_out = LaidOut.of(box, voxel_id, known, lattice, quantised)
+    laid_out.code(coder)
+    return laid_out.read() if quantised is None else quantised
 
 
-def _fill(rows: I32, box: Box, q: Quantised, *, keep_self: bool = False) -> None:
-    rows[:, v.Z], rows[:, v.Y], rows[:, v.X] = box.places(q.voxel_id)
+def _fill_places(rows: I32, places: tuple[I64, I64, I64]) -> None:
+    rows[:, v.Z], rows[:, v.Y], rows[:, v.X] = places
+
+
+def _fill(rows: I32, q: Quantised) -> None:
     rows[:, v.AXIS], rows[:, v.COUNT] = q.axis, q.count
     rows[:, v.LEVEL : v.LEVEL + 3], rows[:, v.SLOPE : v.SLOPE + 3], rows[:, v.STEP : v.STEP + 3] = (
         q.level,
         q.slope,
         q.step,
     )
-    if not keep_self:
-        rows[:, v.SELF] = -1
 
 
-def _read(rows: I32, voxel_id: I32) -> Quantised:
-    columns = (
-        rows[:, v.AXIS],
-        rows[:, v.LEVEL : v.LEVEL + 3],
-        rows[:, v.SLOPE : v.SLOPE + 3],
-        rows[:, v.STEP : v.STEP + 3],
-    )
-    axis, level, slope, step = (np.ascontiguousarray(c) for c in columns)
-    return Quantised(voxel_id, axis, level, slope, step, np.ascontiguousarray(rows[:, v.COUNT]))
-
-
+@lru_cache(maxsize=16)
 def _typical(lattice: Lattice) -> I32:
     """A row of values to expect where no neighbour is known: 1.5 cm thick, 28 cm wide, some hundred points."""
     row = np.zeros(v.COLUMNS, np.int32)
@@ -198,26 +252,34 @@ def _typical(lattice: Lattice) -> I32:
     return row
 
 
-def _coding(
-    coder: Coder, table: I32, where: I32, lattice: Lattice, grid: VoxelGrid, *, has_base: bool
-) -> v.VoxelCoding:
+@lru_cache(maxsize=16)
+def _sizes(lattice: Lattice) -> tuple[I64, I64]:
+    """Standard deviations, and the largest numbers of the families that have one."""
+    top = len(lattice.sd) - 1
+    tops = [top, top // lattice.plane_step, top // lattice.plane_step, MOST_COUNT]
+    return np.array(lattice.sd, np.int64), np.array(tops, np.int64)
+
+
+def _coding(coder: Coder, laid_out: LaidOut) -> v.VoxelCoding:
+    lattice, grid, (_, ny, nx) = laid_out.lattice, laid_out.box.grid, laid_out.where.shape
     # 1/256 m: coarse enough that no machine's sine rounds it another way
-    top, floor_step, line_step = len(lattice.sd) - 1, where.shape[1] * where.shape[2], where.shape[2]
     pitch = [round(size_m * 256) << (lattice.mean_bits - 8) for size_m in (grid.dx_m, grid.dy_m, grid.dz_m)]
+    has_base = laid_out.n_known > 0
+    sd, tops = _sizes(lattice)
     return v.VoxelCoding(
         coder.state,
         VOXELS_AT,
         VOXEL_WEIGHTS_AT,
-        table,
-        where.reshape(-1),
-        floor_step,
-        line_step,
-        v.neighbours(floor_step, line_step, only_before=not has_base),
+        laid_out.table,
+        laid_out.where.reshape(-1),
+        ny * nx,
+        nx,
+        v.neighbours(ny * nx, nx, only_before=not has_base),
         np.zeros(1 + v.NEIGHBOURS + 1, np.int64),
         np.zeros(v.MOST_REFS + 1, np.int64),
         np.zeros(v.MEMO, np.int64),
-        np.array([top, top // lattice.plane_step, top // lattice.plane_step, MOST_COUNT], np.int64),
-        np.array(lattice.sd, np.int64),
+        tops,
+        sd,
         np.array(pitch, np.int64),
         lattice.plane_step,
         lattice.slope_bits,

@@ -6,6 +6,7 @@ D by a level (a standard deviation of the lattice), the others by a slope each; 
 L. Integers only, as in `kernels`: what is coded is the difference from what the neighbours let expect.
 """
 
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -179,6 +180,7 @@ class _Voxel(NamedTuple):
     second: int
 
 
+@lru_cache(maxsize=256)
 def neighbours(floor_step: int, line_step: int, *, only_before: bool) -> I64:
     """(K,) steps in `where` to the neighbours of a voxel: across faces, then edges, then corners; or to those before it
     in order: where both sides hold nothing, no other can be known.
@@ -329,7 +331,7 @@ def _level_c_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
     for i in range(v.n):
         level = table[m.refs[i], LEVEL + 2]
         mean, low, high = mean + level, min(low, level), max(high, level)
-    mean = _ratio(mean, v.n) if v.n > 0 else table[0, LEVEL + 2]
+    mean = _mean(mean, v.n) if v.n > 0 else table[0, LEVEL + 2]
     spread = min(high - low, 5) if v.n > 1 else 0
     d = _two_neighbours(v, table[v.first, LEVEL + 2] - mean, table[v.second, LEVEL + 2] - mean)
     return (
@@ -354,7 +356,7 @@ def _count_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
     table, mean = m.table, 0
     for i in range(v.n):
         mean += table[m.refs[i], COUNT]
-    mean = _ratio(mean, v.n) if v.n > 0 else table[0, COUNT]
+    mean = _mean(mean, v.n) if v.n > 0 else table[0, COUNT]
     d = _two_neighbours(v, table[v.first, COUNT] - mean, table[v.second, COUNT] - mean)
     wide = min(table[v.row, LEVEL] + table[v.row, LEVEL + 1], 23)
     return min(v.n, 3) * 3 + v.kind, _clip(mean, 0, 23), wide, d, v.occupied * 2 + (v.n > 0), mean
@@ -383,7 +385,7 @@ def _slope_cb_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
         tilt_a, tilt_b = tilt_a + ta, tilt_b + tb
         low_a, high_a, low_b, high_b = min(low_a, ta), max(high_a, ta), min(low_b, tb), max(high_b, tb)
     if v.n > 0:
-        tilt_a, tilt_b = _ratio(tilt_a, v.n), _ratio(tilt_b, v.n)
+        tilt_a, tilt_b = _mean(tilt_a, v.n), _mean(tilt_b, v.n)
     doubt_a = _bucket(_ratio((high_a - low_a) * D1 >> _BITS << m.slope_bits, D3)) if v.n > 1 else 0
     doubt_b = _bucket(_ratio((high_b - low_b) * D2 >> _BITS << m.slope_bits, D3)) if v.n > 1 else 0
     m.memo[_TILT_A], m.memo[_TILT_B], m.memo[_DOUBT_A] = tilt_a, tilt_b, doubt_a
@@ -447,13 +449,13 @@ def _step_c_expected(m: VoxelCoding, v: _Voxel) -> _Expected:
         if i == 0:
             nearest = h
         low, high = min(low, h), max(high, h)
-    mean = _ratio(height, v.n) if v.n > 0 else 0
+    mean = _mean(height, v.n) if v.n > 0 else 0
     want = _clip(_ratio(mean - mu_c, quantum), -4000, 4000) if v.n > 0 else 0
     doubt = _bucket(_ratio(high - low, quantum)) if v.n > 1 else 0
     thin = _clip(table[row, LEVEL + 2], 0, 23)
     d = e = 0
     if m.five == 1:
-        d = (_clip(_ratio(_ratio(smooth, max(v.n, 1)) - mean, quantum), -6, 6) + 6) * 12
+        d = (_clip(_ratio(_mean(smooth, max(v.n, 1)) - mean, quantum), -6, 6) + 6) * 12
         d += min(doubt, 3) * 3 + min(_bucket(_ratio(nearest - mean, quantum)), 2)
         e = (_inside(m, v, want * quantum + mu_c) * 4 + v.around_c) * 9 + min(thin // 2, 8)
     odd_a, odd_b = min(_bucket(m.memo[_ODD + _SLOPE_CA]), 3), min(_bucket(m.memo[_ODD + _SLOPE_CB]), 3)
@@ -541,13 +543,19 @@ def _sloped(v: _Voxel, want: int) -> int:
 
 @bare_inlined
 def _bucket(value: int) -> int:
-    """0, 1, 2-3, 4-7, 8-15, more: 0 … 5."""
+    """0, 1, 2-3, 4-7, 8-15, more: 0 … 5. Without a branch, which would be guessed wrong half of the time."""
     size = abs(value)
-    k = 0
-    while size > 0 and k < 5:
-        size >>= 1
-        k += 1
-    return k
+    return (
+        (1 if size > 0 else 0) + (1 if size > 1 else 0) + (1 if size > 3 else 0) + (1 if size > 7 else 0)
+        + (1 if size > 15 else 0)
+    )  # fmt: skip
+
+
+@bare_inlined
+def _mean(total: int, n: int) -> int:
+    """`_ratio` of a sum of 1 to 4 numbers: shifts, and a division by a constant, take a fifth of the time."""
+    third = (2 * total + 3) // 6
+    return third if n == 3 else (2 * total + n) >> (1 + (n >> 1))
 
 
 @bare_inlined
