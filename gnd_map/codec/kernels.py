@@ -107,10 +107,11 @@ def _code(coder: I64, buffer: U8, low: int, high: int, p: int, bit: int) -> Ends
     """
     span = high - low
     middle = low + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
-    if coder[MODE] == 1:
-        bit = 1 if coder[CODE] <= middle else 0
-    elif coder[MODE] == 2:
-        coder[SPENT + coder[FIELD]] += _COST[(p if bit == 1 else _ONE - p) >> 4]
+    if coder[MODE] != 0:
+        if coder[MODE] == 1:
+            bit = 1 if coder[CODE] <= middle else 0
+        else:
+            coder[np.uint64(SPENT + coder[FIELD])] += _COST[np.uint64((p if bit == 1 else _ONE - p) >> 4)]
     low, high = (low, middle) if bit == 1 else (middle + 1, high)
     if ((low ^ high) & 0xFF000000) == 0:
         coder[LOW], coder[HIGH] = low, high
@@ -122,10 +123,9 @@ def _code(coder: I64, buffer: U8, low: int, high: int, p: int, bit: int) -> Ends
 @bare_inlined
 def _learnt(place: int, bit: int) -> int:
     """A context after a decision: its probability moves towards what came, the less the more it has seen."""
-    p, n = place >> 8, place & 0xFF
-    p += ((bit << 16) - bit - p) * _STEP[np.uint64(n)] >> 16
-    learnt: int = p << 8 | min(n + 1, _LIMIT)
-    return learnt
+    n = place & 0xFF  # at most _LIMIT
+    moved = ((bit << 16) - bit - (place >> 8)) * _STEP[np.uint64(n)] >> 16
+    return place + (moved << 8) + (1 if n < _LIMIT else 0)
 
 
 @bare_inlined
