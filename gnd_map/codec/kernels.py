@@ -124,7 +124,7 @@ def _code(coder: I64, buffer: U8, low: int, high: int, p: int, bit: int) -> Ends
 def _learnt(place: int, bit: int) -> int:
     """A context after a decision: its probability moves towards what came, the less the more it has seen."""
     n = place & 0xFF  # at most _LIMIT
-    moved = ((bit << 16) - bit - (place >> 8)) * _STEP[np.uint64(n)] >> 16
+    moved: int = ((bit << 16) - bit - (place >> 8)) * _STEP[np.uint64(n)] >> 16
     return place + (moved << 8) + (1 if n < _LIMIT else 0)
 
 
@@ -151,9 +151,7 @@ def code_bit(state: State, at: int, bit: int) -> int:
     """One decision in one context."""
     coder, buffer, places, _ = state
     place = places[at]
-    bit, coder[LOW], coder[HIGH] = _code(
-        coder, buffer, coder[LOW], coder[HIGH], min(max(place >> 8, 6), _ONE - 6), bit
-    )
+    bit, coder[LOW], coder[HIGH] = _code(coder, buffer, coder[LOW], coder[HIGH], min(max(place >> 8, 6), _ONE - 6), bit)
     places[at] = _learnt(place, bit)
     return bit
 
@@ -164,7 +162,7 @@ def _mixed(state: State, low: int, high: int, at: Three, w: int, bit: int) -> En
     coder, buffer, places, weight = state
     # Indices are never negative: without a sign nothing is spent on those that would be.
     a, b, c, row = np.uint64(at[0]), np.uint64(at[1]), np.uint64(at[2]), np.uint64(w)
-    pa, pb, pc = np.int64(places[a]), np.int64(places[b]), np.int64(places[c])
+    pa, pb, pc = int(places[a]), int(places[b]), int(places[c])
     sa, sb, sc = _stretch(pa), _stretch(pb), _stretch(pc)
     wa, wb, wc = weight[row, _U0], weight[row, _U1], weight[row, _U2]
     p = _squash(wa * sa + wb * sb + wc * sc)
@@ -182,8 +180,8 @@ def _mixed_5(state: State, low: int, high: int, at: Five, w: int, bit: int) -> E
     coder, buffer, places, weight = state
     a, b, c, d, e = np.uint64(at[0]), np.uint64(at[1]), np.uint64(at[2]), np.uint64(at[3]), np.uint64(at[4])
     row = np.uint64(w)
-    pa, pb, pc = np.int64(places[a]), np.int64(places[b]), np.int64(places[c])
-    pd, pe = np.int64(places[d]), np.int64(places[e])
+    pa, pb, pc = int(places[a]), int(places[b]), int(places[c])
+    pd, pe = int(places[d]), int(places[e])
     sa, sb, sc, sd, se = _stretch(pa), _stretch(pb), _stretch(pc), _stretch(pd), _stretch(pe)
     wa, wb, wc, wd, we = weight[row, _U0], weight[row, _U1], weight[row, _U2], weight[row, _U3], weight[row, _U4]
     p = _squash(wa * sa + wb * sb + wc * sc + wd * sd + we * se)
@@ -399,17 +397,17 @@ def _code_cells(state: State, held: U8, flag: U8, mark: U8, size: Three, at: int
 def _block_context(mark: U8, z: int, y: int, x: int) -> int:
     """Whether the blocks are marked in which the next voxel along x lies, and the one above: two bits."""
     bz, by, bx = np.uint64(1 + z // BLOCK), np.uint64(1 + y // BLOCK), np.uint64(1 + x // BLOCK)
-    return mark[bz, by, np.uint64(1 + (x + 1) // BLOCK)] + 2 * mark[np.uint64(1 + (z + 1) // BLOCK), by, bx]
+    beside: int = mark[bz, by, np.uint64(1 + (x + 1) // BLOCK)]
+    return beside + 2 * mark[np.uint64(1 + (z + 1) // BLOCK), by, bx]
 
 
 @bare_inlined
-def _code_cell(
-    state: State, held: U8, flag: U8, i: int, steps: tuple[int, int], at: int, w: int, around: int
-) -> int:
+def _code_cell(state: State, held: U8, flag: U8, i: int, steps: tuple[int, int], at: int, w: int, around: int) -> int:
     """One voxel, the one at `i`; 1 where it is flagged. `around` is `_block_context` and whether anything is held."""
     some = around & 1
     a, b, c = _cell_contexts(held, flag, i, steps, some)
-    own, now = np.int64(held[np.uint64(i)]), np.int64(flag[np.uint64(i)])
+    own: Any = np.int64(held[np.uint64(i)])
+    now = flag[np.uint64(i)]
     a, b, c = at + a, at + CELL_A + b, at + CELL_A + CELL_B + (c << 3 | around)
     if code_mixed(state, a, b, c, w + some * 4 + own, 1 if now != NONE else 0) == 0:
         return 0
@@ -441,11 +439,12 @@ def _cell_contexts(held: U8, flag: U8, i: int, steps: tuple[int, int], some: int
         a |= (under & 2) << 6 | (past & 2) << 7 | (far & 1) << 9
         b = nearest | far << 3 | (past & 4) << 4 | (under & 1) << 7
         return a, b, min(near, 7) * 4
-    own = np.int64(held[np.uint64(i)])
+    own: Any = np.int64(held[np.uint64(i)])
     x, y, z = flag[np.uint64(i - 1)], flag[np.uint64(i - line)], flag[np.uint64(i - floor)]
-    a = (np.int64(x) << 4 | np.int64(y) << 2 | np.int64(z)) << 3 | before & 4 | (below & 4) >> 1 | own
+    seen: Any = np.int64(x) << 4 | np.int64(y) << 2 | np.int64(z)
+    a = seen << 3 | before & 4 | (below & 4) >> 1 | own
     b = 256 | _held_pattern(held, i, steps) << 2 | own << 1 | (1 if x != NONE or y != NONE or z != NONE else 0)
-    up = 0
+    up: Any = 0
     for dy in range(-1, 2):
         for dx in range(-1, 2):
             up += np.int64(held[np.uint64(i + dy * line + dx)]) + held[np.uint64(i + floor + dy * line + dx)]

@@ -4,7 +4,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,7 +16,7 @@ import click
 from studies.frame.options import click_options, options_of
 from studies.frame.tables import Sheet, print_sheets
 from studies.speed import yardstick
-from studies.speed.coding import coding_contests
+from studies.speed.coding import coding_contests, tile_contests
 from studies.speed.contest import Contest, raced
 from studies.speed.matching import matching_contest, odometry_contest
 from studies.speed.rays import kernel_contest, scan_contest
@@ -37,14 +37,24 @@ ours" above 1: slower than ours. Beside each time stands how good the result is:
 """
 
 
-def contests(options: SpeedOptions, folder: Path) -> Iterator[Contest]:
-    """All of them, each made when it is asked for."""
+WORKS: Final = ("rays", "scans", "matching", "odometry", "coding", "tiles")
+
+
+def contests(options: SpeedOptions, folder: Path, works: Collection[str] = WORKS) -> Iterator[Contest]:
+    """Those of the given works, each made when it is asked for."""
     scene = scene_of(options, SENSOR, folder)
-    yield kernel_contest(scene, folder)
-    yield scan_contest(scene)
-    yield matching_contest(scene)
-    yield odometry_contest(scene_of(options, SPARSE, folder))
-    yield from coding_contests(scene)
+    if "rays" in works:
+        yield kernel_contest(scene, folder)
+    if "scans" in works:
+        yield scan_contest(scene)
+    if "matching" in works:
+        yield matching_contest(scene)
+    if "odometry" in works:
+        yield odometry_contest(scene_of(options, SPARSE, folder))
+    if "coding" in works:
+        yield from coding_contests(scene)
+    if "tiles" in works:
+        yield from tile_contests(scene)
 
 
 def page(command: str, sheets: list[Sheet], now: datetime) -> str:
@@ -79,11 +89,11 @@ def versions() -> str:
     return ", ".join(found)
 
 
-def run(*, out: Path | None, **given: Any) -> None:
-    """Run every contest; print the tables, and write the page where a file is given."""
+def run(*, out: Path | None, only: tuple[str, ...], **given: Any) -> None:
+    """Run every contest, or those of some works; print the tables, and write the page where a file is given."""
     options, sheets = options_of(SpeedOptions, given), []
     with TemporaryDirectory() as folder:
-        for contest in contests(options, Path(folder)):
+        for contest in contests(options, Path(folder), only or WORKS):
             sheets.append(raced(contest, options.rounds))
             print_sheets(sheets[-1:])
     if out is not None:
@@ -92,7 +102,8 @@ def run(*, out: Path | None, **given: Any) -> None:
 
 
 OUT: Final = click.Option(["--out"], type=click.Path(path_type=Path, dir_okay=False), help="Write the page here.")
-COMMAND: Final = click.Command("speed", callback=run, params=[*click_options(SpeedOptions), OUT], help=__doc__)
+ONLY: Final = click.Option(["--only"], type=click.Choice(WORKS), multiple=True, help="This work, no other.")
+COMMAND: Final = click.Command("speed", callback=run, params=[*click_options(SpeedOptions), OUT, ONLY], help=__doc__)
 
 if __name__ == "__main__":
     COMMAND.main(prog_name="python -m studies.speed")

@@ -7,7 +7,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.codec import CODECS, LATTICES, snap
+from gnd.gnd_map.codec import (
+    CODEC_FLOAT32_ZSTD,
+    CODEC_STANDARD,
+    CODEC_STANDARD_SETS,
+    CODEC_STANDARD_ZSTD,
+    CODECS,
+    LATTICES,
+    Codec,
+    codec_of,
+    snap,
+)
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import TileId
 from studies.codec_scenes import kl_median
@@ -18,6 +28,9 @@ CODEC: Final = "standard"
 LAZ_STEP_M: Final = 0.01
 DRACO_BITS: Final = 14
 CLOUD_M: Final = 0.2
+TILE_VOXELS: Final = 2_500
+TILE_CODECS: Final = (CODEC_STANDARD, CODEC_STANDARD_ZSTD, CODEC_FLOAT32_ZSTD)
+"""Beside the one by which tiles are written."""
 NOT_HERE: Final = "not installed (extra `peers`)"
 
 
@@ -56,12 +69,38 @@ def coding_contests(scene: SpeedScene) -> list[Contest]:
     ]
 
 
+def tile_contests(scene: SpeedScene) -> list[Contest]:
+    """Writing and reading the largest tile of the street; times are brought to TILE_VOXELS voxels."""
+    held = ((tile_id, scene.local_map.tile(tile_id)) for tile_id in scene.local_map.tiles)
+    tile_id, tile = max(((i, t.gaussians) for i, t in held if t is not None), key=lambda one: len(one[1]))
+    snapped, units = snap(tile, LATTICES[CODEC], new_map=True), len(tile) / TILE_VOXELS
+    ours, *others = (_tile_coder(codec_of(i), tile_id, snapped) for i in (CODEC_STANDARD_SETS, *TILE_CODECS))
+    notes = (
+        f"The largest tile of the street, {len(tile):,} voxels; times are those of {TILE_VOXELS:,}. The Gaussians lie"
+        " on the lattice *standard*, and their integers are known: a server has snapped the tile before.",
+    )
+    return [
+        Contest("A tile written", "ms/tile", units, _writing(ours), [_writing(one) for one in others], notes),
+        Contest("A tile read", "ms/tile", units, _reading(ours), [_reading(one) for one in others]),
+    ]
+
+
+def _tile_coder(codec: Codec, tile_id: TileId, gaussians: Gaussians) -> MapCoder:
+    return MapCoder(
+        codec.name,
+        lambda: codec.encode(tile_id, gaussians),
+        lambda body: codec.decode(tile_id, body),
+        len,
+        lambda found: "equal to the bit" if found == gaussians else "other Gaussians",
+    )
+
+
 def _unless(one: MapCoder | Absent, entrant: Callable[[MapCoder], Entrant]) -> Entrant | Absent:
     return one if isinstance(one, Absent) else entrant(one)
 
 
 def _writing(coder: MapCoder) -> Entrant:
-    return Entrant(coder.name, coder.write, lambda written: f"{coder.size(written) / 1e3:,.0f} kB")
+    return Entrant(coder.name, coder.write, lambda written: f"{coder.size(written) / 1e3:,.3g} kB")
 
 
 def _reading(coder: MapCoder) -> Entrant:
