@@ -397,8 +397,9 @@ def _code_cells(state: State, held: U8, flag: U8, mark: U8, size: Three, at: int
 def _block_context(mark: U8, z: int, y: int, x: int) -> int:
     """Whether the blocks are marked in which the next voxel along x lies, and the one above: two bits."""
     bz, by, bx = np.uint64(1 + z // BLOCK), np.uint64(1 + y // BLOCK), np.uint64(1 + x // BLOCK)
-    beside: int = mark[bz, by, np.uint64(1 + (x + 1) // BLOCK)]
-    return beside + 2 * mark[np.uint64(1 + (z + 1) // BLOCK), by, bx]
+    beside = mark[bz, by, np.uint64(1 + (x + 1) // BLOCK)]
+    found: int = beside + 2 * mark[np.uint64(1 + (z + 1) // BLOCK), by, bx]
+    return found
 
 
 @bare_inlined
