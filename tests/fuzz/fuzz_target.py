@@ -78,6 +78,8 @@ class Watch:
         except self.target.refuses as error:
             self.refused += 1
             self.outcome = place_of(error)
+            if _of_memory(error):
+                return Finding("memory", f"no room at {place_of(error)}", data)
         except (Exception, SystemExit) as error:
             return Finding("foreign", f"{type(error).__name__} at {place_of(error)}: {str(error)[:200]}", data)
         took_s = time.process_time() - began_s
@@ -86,6 +88,14 @@ class Watch:
             return Finding("hang", f"{took_s:.1f} s", data)
         grown = peak_rss_bytes() - before_bytes  # the peak never falls: who lifts it by so much has taken so much
         return Finding("memory", f"{grown >> 20} MB", data) if grown > MAX_GROWTH_BYTES else None
+
+
+def _of_memory(error: BaseException) -> bool:
+    """Whether a refusal came of memory that was not there: on a larger machine it would have been taken."""
+    before: BaseException | None = error
+    while before is not None and not isinstance(before, MemoryError):
+        before = before.__cause__ or before.__context__
+    return before is not None
 
 
 def peak_rss_bytes() -> int:

@@ -3,6 +3,7 @@
 import struct
 import zlib
 from binascii import crc_hqx
+from functools import cache
 from random import Random
 
 import numpy as np
@@ -133,12 +134,22 @@ def _zstd_text(data: bytes, rng: Random) -> bytes:
     if kind == 0:
         return bytes_mutated(data, rng)
     if kind == 1:
-        return zstandard.ZstdCompressor().compress(bytes(1 << 28)) if rng.randrange(50) == 0 else b""
+        return _zstd_bomb() if rng.randrange(50) == 0 else b""
     try:
         plain = zstd_unpacked(data, 1 << 20)
     except ValueError:
         return bytes_mutated(data, rng)
     return zstandard.ZstdCompressor(level=1).compress(text_mutated(plain, rng))
+
+
+@cache
+def _zstd_bomb() -> bytes:
+    return zstandard.ZstdCompressor().compress(bytes(1 << 28))
+
+
+@cache
+def _zlib_bomb() -> bytes:
+    return zlib.compress(b" " * (1 << 28), 1)
 
 
 def _zlib_text(data: bytes, rng: Random) -> bytes:
@@ -147,7 +158,7 @@ def _zlib_text(data: bytes, rng: Random) -> bytes:
     except ValueError:
         return bytes_mutated(data, rng)
     if rng.randrange(400) == 0:
-        plain = b" " * (1 << 28)
+        return _zlib_bomb()
     return zlib.compress(text_mutated(plain, rng), 1) if rng.randrange(8) else bytes_mutated(data, rng)
 
 

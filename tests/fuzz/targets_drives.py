@@ -2,7 +2,9 @@
 
 import io
 import json
+import lzma
 import struct
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
@@ -10,17 +12,21 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import dpkt
 import laspy
 import numpy as np
 from bag_testing import cloud as ros_cloud
 from bag_testing import fix as ros_fix
 from bag_testing import write_bag
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from fuzz_folder import folder, in_recording, on_file
-from fuzz_mutators import bytes_mutated, text_mutated
+from fuzz_mcap import mcap_mutated
+from fuzz_mutators import bytes_mutated, message_mutated, text_mutated
 from fuzz_target import FuzzTarget
 from lzf_testing import lzf_compress
+from mcap_protobuf.writer import Writer as ProtobufWriter
 from ouster_testing import capture_packets, metadata, write_pcap
-from targets_bus import _items
+from targets_bus import ITEM_MESSAGES, _items
 
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
@@ -41,6 +47,7 @@ from gnd.vehicle_agent.localise.drawn_map import read_fixes
 from gnd.vehicle_agent.localise.drawn_map import read_track as read_drawn_track
 from gnd.vehicle_agent.way import read_way
 
+_FOXGLOVE = {"<f4": 7, "<u4": 5, "<u2": 3}
 ANCHOR = RecordingAnchor(49.0, 8.4, 160.0, 90.0)
 Files = Callable[[], Mapping[str, bytes]]
 
@@ -77,6 +84,25 @@ def _drive() -> bytes:
 
 def _read_drive(path: Path) -> object:
     return read_header(path), load_track(path), list(read_drive(path))
+
+
+@cache
+def _foreign() -> bytes:
+    """Clouds of Foxglove, as another program writes them."""
+    path = folder("seeds") / "foreign.mcap"
+    points = _points()
+    with path.open("wb") as stream, ProtobufWriter(stream) as writer:
+        for k in range(3):
+            cloud = PointCloud(point_stride=points.dtype.itemsize, data=_points(seed=k).tobytes(), frame_id="lidar")
+            cloud.timestamp.FromNanoseconds(10**18 + k * 10**8)
+            for name, (kind, offset) in (points.dtype.fields or {}).items():
+                cloud.fields.add(name=name, offset=offset, type=_FOXGLOVE[kind.str])
+            writer.write_message("/points", cloud, log_time=10**18 + k * 10**8)
+    return path.read_bytes()
+
+
+_MESSAGES = {kind.DESCRIPTOR.full_name: message_mutated(kind) for kind in (*ITEM_MESSAGES.values(), PointCloud)}
+_drive_mutated = mcap_mutated(_MESSAGES)
 
 
 def _trajectory() -> Trajectory:
@@ -196,6 +222,23 @@ def _ouster() -> dict[str, bytes]:
     return {"a.pcap": pcap, "a.json": metadata(made / "ouster.json", beams=4, columns=32).read_bytes()}
 
 
+def _ouster_ng() -> dict[str, bytes]:
+    """The same as pcapng: a section, an interface that says how its times count, a block a packet."""
+    made, pcap = _ouster(), io.BytesIO()
+    pcap.write(_ng_block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)))
+    pcap.write(_ng_block(1, struct.pack("<HHI", 1, 0, 1 << 18) + struct.pack("<HHB3xHH", 9, 1, 9, 0, 0)))
+    for stamp_s, frame in dpkt.pcap.Reader(io.BytesIO(made["a.pcap"])):
+        high, low = divmod(round(stamp_s * 10**9), 1 << 32)
+        packed = frame + bytes(-len(frame) % 4)
+        pcap.write(_ng_block(6, struct.pack("<IIIII", 0, high, low, len(frame), len(frame)) + packed))
+    return {"a.pcap": pcap.getvalue(), "a.json": made["a.json"]}
+
+
+def _ng_block(kind: int, body: bytes) -> bytes:
+    size = 12 + len(body)
+    return struct.pack("<II", kind, size) + body + struct.pack("<I", size)
+
+
 def _velodyne() -> dict[str, bytes]:
     """Packets of a VLP-16 whose azimuths go round in twelve packets."""
     packets = []
@@ -269,8 +312,6 @@ def _nuscenes() -> dict[str, bytes]:
 
 
 def _apollo_map() -> dict[str, bytes]:
-    import zlib
-
     cell = struct.pack("<iffII12f", 3, 0.1, 0.0, 0, 4, *([0.4, 0.5, 0.6] + [0.3] * 9))
     column = struct.pack("<I", 1) + cell + struct.pack("<iiI", 3, 3, 0)
     body = zlib.compress(struct.pack("<2I", 1, 2) + column + column)
@@ -278,6 +319,18 @@ def _apollo_map() -> dict[str, bytes]:
     config = (b"<version>map_ndt_v01</version><x>2</x><resolutions><resolution>1.0</resolution></resolutions>"
               b"<resolutions_z><resolution>1.0</resolution></resolutions_z>")  # fmt: skip
     return {"ndt_map/map/000/north/10/00000100/00000050": node, "ndt_map/config.xml": config}
+
+
+def _apollo_mutated(data: bytes, rng: Random) -> bytes:
+    """What is packed in a node changes, or bytes of the node."""
+    if rng.randrange(4) == 0:
+        return bytes_mutated(data, rng)
+    try:
+        plain = bytes_mutated(zlib.decompressobj().decompress(data[20:], 1 << 20), rng)
+    except zlib.error:
+        return bytes_mutated(data, rng)
+    body = zlib.compress(plain, 1)
+    return data[:16] + struct.pack("<I", len(body)) + body
 
 
 def _poses_texts() -> list[bytes]:
@@ -302,11 +355,12 @@ def _poses_texts() -> list[bytes]:
 
 
 def _xz(data: bytes, rng: Random) -> bytes:
-    import lzma
+    return _xz_bomb() if rng.randrange(2000) == 0 else bytes_mutated(data, rng)
 
-    if rng.randrange(300) == 0:
-        return lzma.compress(bytes(1 << 28), preset=0)
-    return bytes_mutated(data, rng)
+
+@cache
+def _xz_bomb() -> bytes:
+    return lzma.compress(bytes(1 << 28), preset=0)
 
 
 _IMPORTERS = "vehicle_agent/importers"
@@ -314,7 +368,7 @@ TARGETS = (
     FuzzTarget("drive", ("schemas/drive_mcap.py:read_header", "schemas/drive_mcap.py:read_drive",
                          "schemas/drive_mcap.py:load_track", "schemas/mcap_file.py:open_mcap",
                          "src/gnd/recorded.py:open_drive"),
-               "a drive (MCAP)", on_file("drive.mcap", _read_drive), lambda: [_drive()], bytes_mutated),
+               "a drive (MCAP)", on_file("drive.mcap", _read_drive), lambda: [_drive()], _drive_mutated),
     FuzzTarget("tum", ("schemas/trajectory_files.py:read_tum",),
                "TUM trajectories",
                on_file("tum.txt", read_tum), lambda: [tum_text(_trajectory()).encode()], text_mutated),
@@ -337,20 +391,24 @@ TARGETS = (
     FuzzTarget("laz", (), "LAZ files", in_recording("laz", _las_files("laz"), "1.laz", opened("las")),
                lambda: [_las(True)], bytes_mutated, rounds=40),
     FuzzTarget("xz", (f"{_IMPORTERS}/files.py:read_file",), "packed scans (xz)", on_file("a.bin.xz", read_file),
-               lambda: [__import__("lzma").compress(_bins(4))], _xz, rounds=20),
+               lambda: [lzma.compress(_bins(4))], _xz, rounds=20),
     FuzzTarget("point-cloud2", (f"{_IMPORTERS}/point_cloud2.py:decode_cloud", f"{_IMPORTERS}/fields.py:unpack"),
                "sensor_msgs/PointCloud2 (CDR)", _cloud, lambda: [_cloud_message()], bytes_mutated),
     _recording_target("bag-mcap", (f"{_IMPORTERS}/ros/reader.py:open_ros", f"{_IMPORTERS}/ros/bag.py:Bag.decode",
                                    f"{_IMPORTERS}/ros/small_messages.py:read_small"),
-                      "bags of ROS 2 (MCAP)", "ros", lambda: {"bag.mcap": _bag("mcap")}, "bag.mcap", bytes_mutated,
+                      "bags of ROS 2 (MCAP)", "ros", lambda: {"bag.mcap": _bag("mcap")}, "bag.mcap", mcap_mutated({}),
                       rounds=20),
     _recording_target("bag-sqlite", (), "bags of ROS 2 (SQLite)", "ros", lambda: {"bag.db3": _bag("sqlite3")},
                       "bag.db3", bytes_mutated, rounds=10),
     _recording_target("foreign-mcap", (f"{_IMPORTERS}/mcap_clouds.py:open_mcap_clouds",), "MCAP files of clouds",
-                      "mcap", lambda: {"a.mcap": _drive()}, "a.mcap", bytes_mutated, rounds=20),
+                      "mcap", lambda: {"a.mcap": _foreign()}, "a.mcap", _drive_mutated, rounds=20),
+    _recording_target("own-drive", (), "a drive as a recording (MCAP)", "mcap", lambda: {"a.mcap": _drive()}, "a.mcap",
+                      _drive_mutated, rounds=10),
     _recording_target("ouster-pcap", (f"{_IMPORTERS}/pcap.py:open_pcap", f"{_IMPORTERS}/ouster/capture.py:open_ouster",
                                       f"{_IMPORTERS}/ouster/frames.py:OusterFrames.read"),
                       "captures of Ouster (pcap)", "pcap", _ouster, "a.pcap", bytes_mutated, "a.pcap", rounds=20),
+    _recording_target("ouster-pcapng", (), "captures of Ouster (pcapng)", "pcap", _ouster_ng, "a.pcap", bytes_mutated,
+                      "a.pcap", rounds=20),
     _recording_target("ouster-metadata", (f"{_IMPORTERS}/ouster/metadata.py:read_metadata",), "metadata of Ouster",
                       "pcap", _ouster, "a.json", text_mutated, "a.pcap", rounds=20),
     FuzzTarget("ouster-metadata-alone", (), "metadata of Ouster (JSON)", on_file("a.json", read_metadata),
@@ -373,7 +431,10 @@ TARGETS = (
       for table in ("scene", "log", "sample_data", "ego_pose", "calibrated_sensor")),
     FuzzTarget("apollo-ndt-map", (f"{_IMPORTERS}/apollo_map.py:read_ndt_map",), "Apollo's NDT map",
                in_recording("apollo-ndt-map", _apollo_map, "ndt_map/map/000/north/10/00000100/00000050", read_ndt_map),
-               lambda: [_apollo_map()["ndt_map/map/000/north/10/00000100/00000050"]], bytes_mutated),
+               lambda: [_apollo_map()["ndt_map/map/000/north/10/00000100/00000050"]], _apollo_mutated),
+    FuzzTarget("apollo-ndt-config", (), "Apollo's NDT map: config.xml",
+               in_recording("apollo-ndt-config", _apollo_map, "ndt_map/config.xml", read_ndt_map),
+               lambda: [_apollo_map()["ndt_map/config.xml"]], text_mutated),
     FuzzTarget("poses", (f"{_IMPORTERS}/trajectories/pose_file.py:read_poses",),
                "poses: TUM, KITTI, CSV, RTKLIB, NMEA, GeoJSON", on_file("poses.txt", read_poses), _poses_texts,
                text_mutated),

@@ -1,4 +1,7 @@
+import re
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +102,14 @@ def test_damage_is_told(folder: Path, tmp_path: Path) -> None:
     node = next((broken / "ndt_map" / "map").rglob("00004596"))
     node.write_bytes(node.read_bytes()[:5000])
     with pytest.raises(ImportDriveError, match="no node of an NDT map"):
+        read_ndt_map(broken)
+    endless = zlib.compress(struct.pack("<2I", 2**32 - 1, 0))  # rows without a column: nothing in them ends the loop
+    node.write_bytes(struct.pack("<5I", 0, 10, 1, 4596, len(endless)) + endless)
+    with pytest.raises(ImportDriveError, match="4294967295 rows of 0 columns in 8 bytes"):
+        read_ndt_map(broken)
+    config = broken / "ndt_map" / "config.xml"
+    config.write_text(re.sub(r"<x>\d+</x>", f"<x>{'9' * 400}</x>", config.read_text()))
+    with pytest.raises(ImportDriveError, match=r"cells of \[inf, .*at most \(65536.0, "):
         read_ndt_map(broken)
     (broken / "pcds" / "poses.txt").write_text("1 2 3\n")
     with pytest.raises(ImportDriveError, match="a line a scan of 9"):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import struct
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.ouster.metadata import read_metadata
 from gnd.vehicle_agent.importers.ouster.points import PointTable
 from gnd.vehicle_agent.importers.recording import RecordingAnchor
+from gnd.vehicle_agent.importers.udp_packets import UdpCapture
 
 ANCHOR = RecordingAnchor(48.1, 11.5, 520.0)
 FULL = 64 * 16
@@ -215,6 +217,38 @@ def test_metadata_that_do_not_fit_are_refused(tmp_path):
         opened(tmp_path, capture_packets(), lidar_to_sensor_transform=[2.0] * 16)
     with pytest.raises(ImportDriveError, match="16 altitudes and 3 azimuths"):
         opened(tmp_path, capture_packets(), beam_azimuth_angles=[0.0] * 3)
+
+
+def test_sizes_of_no_sensor_are_refused_before_room_is_made_for_them(tmp_path):
+    with pytest.raises(ImportDriveError, match="2147483648 columns a frame"):
+        read_metadata(metadata(tmp_path / "a.json", columns=2**31))
+    with pytest.raises(ImportDriveError, match=r"2000 altitudes and 2000 azimuths \(1 \.\.\. 1024\)"):
+        read_metadata(metadata(tmp_path / "a.json", beams=2_000))
+
+
+def test_packets_longer_than_any_end_the_capture_there(tmp_path):
+    opened(tmp_path, capture_packets())
+    path = tmp_path / "a.pcap"
+    data = bytearray(path.read_bytes())
+    size = struct.unpack_from("<I", data, 24 + 8)[0]
+    at = 24 + 14 * (16 + size) + 8  # the fifteenth packet of sixteen says that it is of 4 GiB
+    data[at : at + 4] = b"\xff" * 4
+    path.write_bytes(data)
+    recording = open_recording("auto", path, ANCHOR)
+    assert noted(recording, "damaged after 14 packets, the rest is left out: a packet or block of 4294967295 bytes")
+    assert len(recording) == 3
+
+
+def test_pieces_of_a_packet_that_never_ends_are_counted_once_each(tmp_path):
+    ip = b"\0" * 12 + b"\x08\x00" + struct.pack(">BBHHHBBH8x", 0x45, 0, 0, 7, 0x2000, 64, 17, 0)
+    frames = b"".join(
+        struct.pack("<IIII", 1, 0, 42, 42) + ip[:20] + struct.pack(">H", 0x2000 | k) + ip[22:] + b"12345678"
+        for k in range(8191)
+    )
+    (tmp_path / "a.pcap").write_bytes(struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 1 << 18, 1) + frames)
+    capture = UdpCapture(tmp_path / "a.pcap")
+    assert list(capture.packets()) == []
+    assert capture.incomplete == 1
 
 
 def test_without_metadata_it_says_where_to_get_them(tmp_path):

@@ -31,6 +31,7 @@ _INVERSE_BYTES: Final = 37  # inverse covariance, and whether there is one
 _INVERSE_FROM: Final = 6  # cells of so many points hold it
 _COLUMN_END: Final = struct.Struct("<iiI")  # highest and lowest cell, and how many numbers of road cells follow
 _MAX_NODE_BYTES: Final = 1 << 26
+_MOST_OF_SIZES: Final = (65_536.0, 1_000.0, 1_000.0)
 _PATTERNS: Final = (r"<x>(\d+)</x>", r"<resolutions><resolution>([\d.]+)<", r"<resolutions_z><resolution>([\d.]+)<")
 
 
@@ -78,9 +79,14 @@ def read_ndt_map(folder: Path) -> NdtCells:
 def _sizes(path: Path) -> _Sizes:
     text = read_file(path).decode("utf-8", "replace")
     found = [re.search(pattern, text) for pattern in _PATTERNS]
-    values = [float(one.group(1)) for one in found if one]
+    try:
+        values = [float(one.group(1)) for one in found if one]
+    except ValueError:
+        values = []
     if "map_ndt_v01" not in text or len(values) != len(_PATTERNS):
         raise ImportDriveError(f"{path}: no configuration of a map_ndt_v01")
+    if not all(0.0 < value <= most for value, most in zip(values, _MOST_OF_SIZES, strict=True)):
+        raise ImportDriveError(f"{path}: cells of {values}; each is above 0 and at most {_MOST_OF_SIZES}")
     return _Sizes(int(values[0]), values[1], values[2])
 
 
@@ -93,7 +99,7 @@ def _node(path: Path, sizes: _Sizes) -> Iterator[tuple[tuple[float, ...], tuple[
         for y, x, level, moments in _cells(body):
             corner = ((east * sizes.cells + x) * sizes.cell_m, (north * sizes.cells + y) * sizes.cell_m)
             yield (*corner, level * sizes.height_m), moments
-    except (struct.error, zlib.error) as error:
+    except (struct.error, zlib.error, ValueError) as error:
         raise ImportDriveError(f"{path}: {len(data)} bytes that are no node of an NDT map: {error}") from error
 
 
@@ -101,6 +107,8 @@ def _cells(body: bytes) -> Iterator[tuple[int, int, int, tuple[float, ...]]]:
     """Of each cell its numbers to the north, to the east and upwards, and its points and moments (13)."""
     rows, columns = _SIZES.unpack_from(body)
     at = _SIZES.size
+    if rows and rows * columns * (_COUNT.size + _COLUMN_END.size) not in range(1, len(body)):
+        raise ValueError(f"{rows} rows of {columns} columns in {len(body)} bytes")
     for row in range(rows):
         for column in range(columns):
             (n,) = _COUNT.unpack_from(body, at)

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F32, F64
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
 
@@ -115,7 +116,7 @@ def time_rule(points: NDArray[np.void], choice: FieldChoice = ANY_FIELD) -> Time
     field = choice.time or next((name for name in TIME_FIELDS if name in names), None)
     if field is None or points[field].ndim > 1:
         return TimeRule(None)
-    values = points[field].astype(np.float64)
+    values = _floats(points[field])
     values = values[np.isfinite(values)]
     if not len(values):
         return TimeRule(field, UNITS_NS[choice.unit or "s"])
@@ -135,14 +136,26 @@ def scan_of_fields(points: NDArray[np.void], t_ns: int, rule: TimeRule | None = 
     The sweep begins with its earliest point: before the stamp where the driver stamps the end and counts backwards.
     """
     names = points.dtype.names or ()
-    xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    xyz = xyz_of(points)
     rule = time_rule(points) if rule is None else rule
     ring = next((name for name in RING_FIELDS if name in names), None)
     begin_ns, offset = t_ns, np.zeros(len(points), np.uint32)
     if rule.field is not None and rule.field in names:
         begin_ns, offset = times_of(points[rule.field], t_ns, rule)
     rings = None if ring is None or points[ring].ndim > 1 else _rings(points[ring])
-    return RawScan(begin_ns, np.ascontiguousarray(xyz), offset, rings)
+    return RawScan(begin_ns, xyz, offset, rings)
+
+
+def xyz_of(points: NDArray[np.void]) -> F32:
+    """(N, 3) float32 of packed points (N,) with x, y, z; what float32 cannot hold is infinite."""
+    # without a warning, which a NaN that signals gives as well
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
+
+
+def _floats(values: NDArray[np.generic]) -> F64:
+    with np.errstate(invalid="ignore", over="ignore"):
+        return values.astype(np.float64)
 
 
 def times_of(values: NDArray[np.generic], t_ns: int, rule: TimeRule) -> tuple[int, NDArray[np.uint32]]:
@@ -152,9 +165,11 @@ def times_of(values: NDArray[np.generic], t_ns: int, rule: TimeRule) -> tuple[in
     `LONGEST_SWEEP_NS`, or values that are no numbers.
     """
     zeros = np.zeros(len(values), np.uint32)
-    if values.ndim != 1 or not len(values) or not np.isfinite(values.astype(np.float64)).all():
+    if values.ndim != 1 or not len(values) or not np.isfinite(_floats(values)).all():
         return t_ns, zeros
     first = values.min()
+    if (float(values.max()) - float(first)) * rule.ns > 2.0 * LONGEST_SWEEP_NS:  # may not fit into their own type
+        return t_ns, zeros
     after = np.round((values - first).astype(np.float64) * rule.ns)
     if after.max() > LONGEST_SWEEP_NS:
         return t_ns, zeros
@@ -166,4 +181,4 @@ def times_of(values: NDArray[np.generic], t_ns: int, rule: TimeRule) -> tuple[in
 
 
 def _rings(values: NDArray[np.generic]) -> NDArray[np.uint16]:
-    return np.asarray(np.clip(np.nan_to_num(values.astype(np.float64)), 0, 65_535).astype(np.uint16))
+    return np.asarray(np.clip(np.nan_to_num(_floats(values)), 0, 65_535).astype(np.uint16))

@@ -23,6 +23,7 @@ from gnd.vehicle_agent.importers.optional import library
 from gnd.vehicle_agent.importers.ouster.capture import UdpStreams, metadata_named, open_ouster
 from gnd.vehicle_agent.importers.ouster.packets import kinds_of_size
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.udp_packets import BoundedFile
 
 EXTRA: Final = "import"
 MAGICS: Final = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
@@ -134,8 +135,9 @@ class _Turns:
         decoder = library("velodyne_decoder", EXTRA)
         config = decoder.Config()
         try:
-            for stamp, points in decoder.read_pcap(str(path), config, as_pcl_structs=True):
-                self._add(stamp.device if stamp.device > 1e8 else stamp.host, points)
+            with path.open("rb") as stream:
+                for stamp, points in decoder.read_pcap(BoundedFile(stream), config, as_pcl_structs=True):
+                    self._add(stamp.device if stamp.device > 1e8 else stamp.host, points)
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
             if strict or not self.index:

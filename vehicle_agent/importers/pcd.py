@@ -20,7 +20,7 @@ from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.damage import number_table
-from gnd.vehicle_agent.importers.fields import ANY_FIELD, FieldChoice, TimeRule, scan_of_fields, time_rule
+from gnd.vehicle_agent.importers.fields import ANY_FIELD, FieldChoice, TimeRule, scan_of_fields, time_rule, xyz_of
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of
 from gnd.vehicle_agent.importers.pcd_format import read_pcd
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
@@ -79,7 +79,7 @@ def scan_number(path: Path) -> tuple[int, str]:
 def read_scan(path: Path, t_ns: int) -> RawScan:
     """The points of one file, all at the time of the sweep."""
     points = _points(path)
-    xyz = np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32)
+    xyz = xyz_of(points)
     return RawScan(t_ns, xyz, np.zeros(len(xyz), np.uint32))
 
 

@@ -8,9 +8,10 @@ import struct
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from decimal import Decimal
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.optional import library
@@ -18,6 +19,11 @@ from gnd.vehicle_agent.importers.optional import library
 EXTRA: Final = "import"
 PENDING: Final = 256
 """Packets whose pieces are waited for at a time; the oldest is given up."""
+MAX_FRAME_BYTES: Final = 1 << 18
+"""The longest that libpcap captures (its MAXIMUM_SNAPLEN); a UDP packet has at most 65,535 bytes."""
+NS: Final = 1_000_000_000
+MAX_STAMP_S: Final = 9_223_372_036
+"""From here on ns do not fit into 64 bits (2262)."""
 _UDP: Final = 17
 _VLAN: Final = (0x8100, 0x88A8)
 _PLAIN_LINKS: Final = {0: 4, 108: 4, 113: 16, 276: 20, 12: 0, 14: 0, 101: 0, 228: 0, 229: 0}
@@ -34,17 +40,39 @@ class UdpPacket:
     payload: bytes
 
 
+class BoundedFile:
+    """A file of which a single read gives at most a longest frame: the library asks for as much as the file says, and
+    cuts options off the front of a block one after the other.
+    """
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self.name, self.seek, self.fileno, self._stream = stream.name, stream.seek, stream.fileno, stream
+
+    def read(self, size: int) -> bytes:
+        """As a file's; ValueError: more than `MAX_FRAME_BYTES`, or fewer than none."""
+        if not 0 <= size <= MAX_FRAME_BYTES:
+            raise ValueError(f"a packet or block of {size} bytes (0 ... {MAX_FRAME_BYTES})")
+        return self._stream.read(size)
+
+
+def _host_ns(stamp_s: float | Decimal) -> int:
+    """A stamp in ns; 0, not known, before 1970 and from 2262 on, which a pcapng can say."""
+    return round(stamp_s * NS) if 0 <= stamp_s < MAX_STAMP_S else 0
+
+
 @dataclass(slots=True)
 class _Pieces:
     parts: dict[int, bytes] = field(default_factory=dict)
     end: int | None = None
+    held: int = 0
 
     def add(self, at: int, data: bytes, *, more: bool) -> bytes | None:
         """The whole packet once it is complete."""
         self.parts[at] = data
+        self.held += len(data)
         if not more:
             self.end = at + len(data)
-        if self.end is None or sum(map(len, self.parts.values())) < self.end:
+        if self.end is None or self.held < self.end:
             return None
         return b"".join(self.parts[one] for one in sorted(self.parts))
 
@@ -74,13 +102,13 @@ class UdpCapture:
         self.incomplete, self.damaged = 0, ""
         with self.path.open("rb") as stream:
             try:
-                reader = reader_of(stream)
+                reader = reader_of(BoundedFile(stream))
                 link = int(reader.datalink())
                 for stamp_s, frame in reader:
                     found = self._udp(self._ip_packet(link, frame))
                     if found is not None:
-                        yield UdpPacket(round(stamp_s * 1_000_000_000), *found)
-            except (ValueError, struct.error, damage) as error:
+                        yield UdpPacket(_host_ns(stamp_s), *found)
+            except (ValueError, OverflowError, struct.error, damage) as error:
                 self.damaged = " ".join(str(error).split())[:200] or type(error).__name__
         self.incomplete += len(self._pending)
         self._pending.clear()

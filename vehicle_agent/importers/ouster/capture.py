@@ -55,7 +55,10 @@ class UdpStreams:
     @property
     def by_size(self) -> Counter[int]:
         """Packets of each length."""
-        return sum(self.sizes.values(), Counter())
+        found = Counter[int]()
+        for sizes in self.sizes.values():  # a sum would copy what it has for each of them
+            found.update(sizes)
+        return found
 
     def of_ouster(self, known: Sequence[OusterMetadata] = ()) -> list[tuple[UdpStream, int]]:
         """UdpStreams, with the length, that look like an Ouster's lidar packets: of a usual setting or of these."""

@@ -31,6 +31,8 @@ TAI_AHEAD_S: Final = 37.0
 """International atomic time against UTC since 2017: a PTP clock that tells no UTC."""
 NEAR_TAI_S: Final = 0.5
 ODD_CLOCK_S: Final = 1.0
+MAX_T_NS: Final = 1 << 62
+"""Later times (2116) are none: differences of two would not fit into 64 bits."""
 MAX_FRAME_NS: Final = 2_000_000_000
 """A turn takes 0.05 to 0.2 s; over a longer one the clock was set."""
 
@@ -120,6 +122,10 @@ class OusterFrames:
         columns = self._packets["columns"]
         number = columns["measurement_id"].astype(np.int64)
         measured, known = (columns["status"] & VALID) != 0, number < self.metadata.columns
+        dated = columns["t_ns"] < MAX_T_NS
+        if (undated := int((measured & ~dated).sum())) > 0:
+            self.notes.append(f"{undated} columns with times after {MAX_T_NS} ns: left out")
+        measured &= dated
         if (beyond := int((measured & ~known).sum())) > 0:
             self.notes.append(f"{beyond} columns beyond the {self.metadata.columns} of the metadata: left out")
         if (empty := int((~measured & np.isin(number, self.metadata.measured)).sum())) > 0:

@@ -19,6 +19,9 @@ from gnd.vehicle_agent.importers.ouster.packets import PROFILES, LidarProfile
 F64 = NDArray[np.float64]
 
 MAX_BYTES: Final = 10 << 20
+MAX_BEAMS: Final = 1024
+MAX_COLUMNS: Final = 8192
+"""Sensors have 128 beams and 4096 columns at most; tables are made for each beam of each column."""
 ROUNDED: Final = 1e-3
 """Rotations with three decimals are rotations."""
 _GROUPS: Final = (
@@ -53,9 +56,12 @@ class OusterMetadata:
     extrinsic: bool
 
     def __post_init__(self) -> None:
-        if not 0 < self.n_beams == len(self.azimuth_rad):
-            raise ImportDriveError(f"{self.path}: {self.n_beams} altitudes and {len(self.azimuth_rad)} azimuths")
-        if self.columns < 1 or self.columns_per_packet < 1 or not all(0 <= one < self.columns for one in self.window):
+        if not 0 < self.n_beams == len(self.azimuth_rad) <= MAX_BEAMS:
+            raise ImportDriveError(
+                f"{self.path}: {self.n_beams} altitudes and {len(self.azimuth_rad)} azimuths (1 ... {MAX_BEAMS})"
+            )
+        fits = 0 < self.columns <= MAX_COLUMNS and 0 < self.columns_per_packet <= MAX_COLUMNS
+        if not fits or not all(0 <= one < self.columns for one in self.window):
             raise ImportDriveError(
                 f"{self.path}: {self.columns} columns a frame, {self.columns_per_packet} a packet, window {self.window}"
             )
