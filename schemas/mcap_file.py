@@ -1,5 +1,6 @@
 """Opening an MCAP file so that damage is noticed: what is read is what was written, or a `DriveError` of one line."""
 
+import io
 import os
 import struct
 import zlib
@@ -71,7 +72,7 @@ def open_mcap(path: Path) -> Iterator[tuple[SeekingReader, Summary]]:
     Raises:
         DriveError: no such file, not MCAP, cut off, damaged.
     """
-    with drive_errors(path), path.open("rb") as stream:
+    with drive_errors(path), _Within(path.open("rb", buffering=0)) as stream:
         _check_summary(stream)
         stream.seek(0)
         reader = SeekingReader(stream, validate_crcs=True, record_size_limit=limits.MAX_CHUNK_BYTES)
@@ -85,6 +86,21 @@ def open_mcap(path: Path) -> Iterator[tuple[SeekingReader, Summary]]:
                     f"the limit is {limits.MAX_CHUNK_BYTES}"
                 )
         yield reader, summary
+
+
+class _Within(io.BufferedReader):
+    """A file of which no more is asked for than there is: the library reads names as long as the file says, and Python
+    makes room for what is asked for.
+    """
+
+    def __init__(self, raw: io.FileIO) -> None:
+        super().__init__(raw)
+        self._size = os.fstat(raw.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As a file's."""
+        left = max(self._size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
 
 
 def _check_summary(stream: IO[bytes]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fuzz_all import TARGETS
 from fuzz_paths import ROOT
-from fuzz_table import PAGE, table
+from fuzz_table import PAGE, counts_table, table
 
 FOLDERS = (
     "gnd_map", "schemas", "fleet_bus", "tile_client", "tile_store", "vehicle_agent", "cloud_merger", "fleet_sim",
@@ -151,4 +151,6 @@ def test_a_new_decoder_would_be_missed() -> None:
 
 
 def test_the_page_lists_the_targets() -> None:
-    assert table() in PAGE.read_text(encoding="utf-8"), "run: python tests/fuzz/fuzz_table.py"
+    page = PAGE.read_text(encoding="utf-8")
+    assert table() in page, "run: python tests/fuzz/fuzz_table.py"
+    assert counts_table() in page, "run: python tests/fuzz/fuzz_table.py"

@@ -1,15 +1,20 @@
 """Bags of ROS 2: containers, sensors with their time fields, GNSS, motion, mounts, poses, damage."""
 
+import io
 import json
 import shutil
+import tracemalloc
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from bag_testing import SECOND, cloud, fix, imu, odometry, transforms, write_bag
 from click.testing import CliRunner
 from recording_testing import scan_of, true_pose
-from rosbags.rosbag2 import CompressionMode
+from rosbags.rosbag2 import CompressionMode, storage_mcap
+from rosbags.rosbag2 import reader as rosbag2_reader
 
 from gnd.extras import MissingExtra
 from gnd.gnd_map.geodesy import LocalFrame
@@ -23,6 +28,7 @@ from gnd.vehicle_agent.importers import optional
 from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.planes import open_planes
 from gnd.vehicle_agent.importers.recording import RecordingAnchor
+from gnd.vehicle_agent.importers.ros.bag import Bag
 from gnd.vehicle_agent.importers.sweep_times import FoundSweep
 
 TOKYO = LocalFrame(np.radians(35.6586), np.radians(139.7454), 60.0)
@@ -303,6 +309,24 @@ def test_a_real_bag_without_clouds(shared_data):
     """Apollo's poses are no bag; the turtlebot's, if it is there, holds odometry only."""
     with pytest.raises(ImportDriveError, match="no single file of a kind that is read"):
         open_recording("auto", shared_data / "apollo_ndt" / "pcds" / "poses.txt")
+
+
+def test_bags_make_room_for_no_more_than_they_hold_and_unpack_to_no_more_than_they_say(tmp_path):
+    write_bag(tmp_path / "bag", [("/points", SECOND, cloud(np.zeros(3, [(axis, "<f4") for axis in "xyz"]), SECOND))])
+    Bag(tmp_path / "bag")  # bounds the library, once a process
+    with pytest.raises(ValueError, match="4611686018427387904 bytes wanted at 0, 5 are left"):
+        storage_mcap.read_exact(io.BytesIO(b"12345"), 1 << 62)
+    for kind, packed in (("zstd", zstandard.compress(bytes(10**7))), ("lz4", lz4.frame.compress(bytes(10**7)))):
+        assert storage_mcap.decompress(packed, kind, 10**7, 0) == bytes(10**7)
+        tracemalloc.start()
+        with pytest.raises((ValueError, storage_mcap.ReaderError), match=r"Zstandard frame of 10000000|got 1001\."):
+            storage_mcap.decompress(packed, kind, 1_000, 0)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+        tracemalloc.stop()
+        with pytest.raises(ValueError, match="a chunk that unpacks to 268435457 bytes"):
+            storage_mcap.decompress(packed, kind, (1 << 28) + 1, 0)
+    with pytest.raises(ValueError, match="Zstandard frame of 268435457 bytes"):
+        rosbag2_reader.zstd.decompress(zstandard.compress(bytes((1 << 28) + 1)))
 
 
 def test_without_rosbags_it_says_which_extra(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from typing import Any, Final
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.files import files_below
 from gnd.vehicle_agent.importers.optional import library
+from gnd.vehicle_agent.importers.ros.bounds import bound_rosbags
 
 ENDINGS: Final = (".mcap", ".db3")
 EXTRA: Final = "ros"
@@ -55,6 +56,7 @@ class Bag:
         self.place = place
         self._rosbag2 = library("rosbags.rosbag2", EXTRA)
         self._typesys = library("rosbags.typesys", EXTRA)
+        bound_rosbags(EXTRA)
         self.notes: tuple[str, ...] = ()
         self._stack = contextlib.ExitStack()
         weakref.finalize(self, self._stack.close)
