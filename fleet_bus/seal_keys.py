@@ -121,6 +121,7 @@ def certificates_of(chain: bytes) -> list["x509.Certificate"]:
         SealError: they are none, or too many.
     """
     from cryptography import x509
+    from cryptography.utils import CryptographyDeprecationWarning
 
     found: list[x509.Certificate] = []
     while chain:
@@ -129,8 +130,10 @@ def certificates_of(chain: bytes) -> list["x509.Certificate"]:
             raise SealError(f"a chain of certificates with {len(chain)} bytes left cannot be read")
         try:
             found.append(x509.load_der_x509_certificate(chain[2 : 2 + size]))
-        except (ValueError, x509.InvalidVersion) as error:
+        except (ValueError, x509.InvalidVersion, CryptographyDeprecationWarning) as error:
             raise SealError(f"certificate {len(found) + 1} of a chain cannot be read: {error}") from None
+        if found[-1].serial_number <= 0:  # of which the library only warns (RFC 5280, 4.1.2.2)
+            raise SealError(f"certificate {len(found)} of a chain has the serial number {found[-1].serial_number}")
         chain = chain[2 + size :]
     if not found:
         raise SealError("a chain without certificates")

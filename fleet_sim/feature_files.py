@@ -73,5 +73,5 @@ def _tile(value: object, where: str) -> FeatureTile:
     try:
         body = base64.b64decode(str(data.get("body")), validate=True)
         return FeatureTile(TileId.from_path(str(data.get("tile"))), int(data.get("version", 0)), decode_features(body))
-    except (GndError, ValueError, TypeError) as error:
+    except (GndError, ValueError, TypeError, OverflowError) as error:
         raise WorldError(f"{where}, tile {str(data.get('tile'))[:40]!r}: {error}") from error

@@ -150,7 +150,10 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_mapping(cast("type[Any]", hint), value, where=where)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ConfigError(f"{where}: a number of {value.bit_length()} bits is too large") from None
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
         return _convert_enum(hint, value, where)
     if hasattr(hint, "__fspath__") and isinstance(value, str):

@@ -45,12 +45,19 @@ class Setting:
     def holds(self, value: float) -> bool:
         """Whether a number is finite and within the range."""
         return (
-            math.isfinite(value)
+            _is_finite(value)
             and (self.least is None or value >= self.least)
             and (self.most is None or value <= self.most)
             and (self.above is None or value > self.above)
             and (self.below is None or value < self.below)
         )
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond what a double holds
+        return False
 
 
 def setting(

@@ -13,6 +13,8 @@ from types import TracebackType
 from typing import Final, Self
 
 from gnd.gnd_map.bounded import json_value
+from gnd.gnd_map.config import from_mapping
+from gnd.gnd_map.errors import ConfigError
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.errors import VehicleError
@@ -95,8 +97,8 @@ def read_way(path: Path) -> Iterator[Milestone]:
         raise VehicleError(f"cannot read the way {path}: {error}") from error
     for line in lines:
         try:
-            one = Milestone(**json_value(line))
-        except (ValueError, TypeError) as error:
+            one = from_mapping(Milestone, json_value(line))
+        except (ValueError, ConfigError) as error:
             raise VehicleError(f"{path} holds a line that is no milestone: {line[:80]!r}") from error
         if found and one.odometer_m < found[-1].odometer_m:
             found.clear()

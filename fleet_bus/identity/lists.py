@@ -86,7 +86,7 @@ def load_revoked(data: bytes, authority: Sequence[x509.Certificate]) -> x509.Cer
         raise IdentityError(f"a list of the revoked of {len(data)} bytes, at most {MAX_LIST_BYTES} are read")
     try:
         found = x509.load_pem_x509_crl(data)
-    except ValueError as error:
+    except (ValueError, x509.InvalidVersion) as error:
         raise IdentityError(f"no list of the revoked in PEM: {error}") from error
     for one in authority:
         with contextlib.suppress(TypeError, ValueError):  # a key that signs no CRL

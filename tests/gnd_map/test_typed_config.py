@@ -75,6 +75,7 @@ def test_every_kind_of_value() -> None:
     [
         ({"vehicle": "a", "vehcle": "b"}, r"Agent: unknown key vehcle; known keys: vehicle, connect"),
         ({"vehicle": "a", "masses": {"lambda_x": 1}}, r"masses: unknown key lambda_x; known keys: lambda_s_block"),
+        ({"vehicle": "a", "link": {"rate_bps": 10**400}}, r"link\.rate_bps: a number of 1329 bits is too large"),
         ({"vehicle": "a", "link": {"rate": 1}}, r"link: unknown key rate; known keys: rate_bps, name"),
         ({}, "missing key vehicle"),
         ({"vehicle": 5}, "vehicle: expected str, got int 5"),
