@@ -92,6 +92,7 @@ EXCEPTIONS = {
     "vehicle_agent/importers/argoverse_logs.py:open_argoverse": BEHIND,
     "vehicle_agent/importers/planes.py:open_planes": BEHIND,
     "vehicle_agent/importers/radiate.py:open_radiate": BEHIND,
+    "vehicle_agent/importers/udp_packets.py:BoundedFile.read": "inside of the targets of captures",
     "vehicle_agent/link/feature_tiles_on_the_bus.py:open_feature_tiles": OPENS,
     "vehicle_agent/link/link.py:open_link": OPENS,
     "vehicle_agent/map_align/sources.py:open_side": "a store or a drive, which have targets",
