@@ -46,7 +46,10 @@ class SqliteConnection(apsw.Connection):
 
     def fetch(self, statement: str, bindings: Bindings = NOTHING) -> list[Row]:
         """All rows of a named statement."""
-        return list(self.execute(SQL[statement], bindings))
+        try:
+            return list(self.execute(SQL[statement], bindings))
+        except UnicodeDecodeError as error:  # a text of a damaged store
+            raise StoreDamaged(f"{self.filename}: damaged (a text that is no UTF-8: {error})") from None
 
     def change(self, statement: str, bindings: Bindings = NOTHING) -> int:
         """Run a named statement; the number of rows that it changed."""
