@@ -1,9 +1,11 @@
-"""Signs the catalogs of the districts that this shard owns: those for which nobody answers, and all again in time."""
+"""Signs the catalogs of the districts that this shard owns, and the lists of its store's districts: those for which
+nobody answers, and all again in time.
+"""
 
 import logging
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
 
@@ -19,6 +21,7 @@ from gnd.tile_store.catalogs import (
     renew_catalogs,
     sign_whole_catalog,
 )
+from gnd.tile_store.district_lists import due_lists, sign_list
 from gnd.tile_store.errors import StoreClosed
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqlStore
@@ -56,6 +59,7 @@ class CatalogSigner:
         self._store, self._members, self._publishers = store, members, publishers
         self._renewed_after_s = renewed_after_s
         self._failed_s: dict[tuple[str, District], float] = {}
+        self._failed_lists_s: dict[str, float] = {}
 
     def work(self) -> int:
         """Sign what is due, of each layer no more than some districts; how many were."""
@@ -64,6 +68,19 @@ class CatalogSigner:
         for due in due_catalogs(self._store, self._publishers, self._members.is_mine, before_s):
             renewed = self._renewed(due.layer, self._left(due.layer, due.renewed))
             n += len(renewed) + self._whole(due.layer, self._left(due.layer, due.whole))
+        return n + self._lists(before_s)
+
+    def _lists(self, before_s: float) -> int:
+        """Sign the lists of districts that are due; any shard may, and who comes second finds nothing to do."""
+        n, again_s = 0, time.monotonic() + FAILED_AGAIN_S
+        for layer in due_lists(self._store, self._publishers, before_s):
+            if self._failed_lists_s.get(layer, 0.0) > time.monotonic():
+                continue
+            why = self._told(lambda layer=layer: sign_list(self._store, layer))  # type: ignore[misc]
+            n += not why
+            if why:
+                self._failed_lists_s[layer] = again_s
+                _LOG.warning("the list of districts of layer %s is not signed: %s", layer, why)
         return n
 
     def _left(self, layer: str, districts: Sequence[District]) -> list[District]:
@@ -85,17 +102,17 @@ class CatalogSigner:
     def _whole(self, layer: str, districts: list[District]) -> int:
         n, again_s = 0, time.monotonic() + FAILED_AGAIN_S
         for district in districts:
-            why = self._signed(layer, district)
+            why = self._told(lambda district=district: sign_whole_catalog(self._store, layer, district))  # type: ignore[misc]
             n += not why
             if why:
                 self._failed_s[layer, district] = again_s
                 _LOG.warning("the catalog of district %s of layer %s is not signed: %s", district, layer, why)
         return n
 
-    def _signed(self, layer: str, district: District) -> str:
-        """Sign a district; why it is not signed, "": it is."""
+    def _told(self, sign: Callable[[], str]) -> str:
+        """Sign something; why it is not signed, "": it is."""
         try:
-            return sign_whole_catalog(self._store, layer, district)
+            return sign()
         except StoreClosed:
             raise
         except GndError as error:

@@ -14,6 +14,7 @@ from gnd.tile_client.archive import Archive
 from gnd.tile_client.archive_check import ArchiveCheck, SeenStates
 from gnd.tile_client.checking import SeenVersion, VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveStale
+from gnd.tile_store.district_lists import mirror_list
 from gnd.tile_store.mirroring import MirroredTile, check_mirror, mirror, mirror_catalog
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import NS_PER_S
@@ -94,10 +95,11 @@ class ArchiveFetcher:
         """
         root = self._root()
         for layer in layers or sorted(root.districts):
-            districts = [one for one in root.districts.get(layer, ()) if _touches(region, one)]
+            districts = [one for one in root.districts.get(layer, ()) if region.touches(one)]
             for place, district in enumerate(districts, 1):
                 self._district(root, layer, district, region)
                 progress(layer, place, len(districts))
+            self._keep_list(root, layer)
         return self.done
 
     def _root(self) -> ArchiveRoot:
@@ -146,6 +148,16 @@ class ArchiveFetcher:
         self._keep_catalog(layer, index)
         self.done.tiles += len(entries)
         self.done.unchanged += len(entries) - len(wanted)
+
+    def _keep_list(self, root: ArchiveRoot, layer: str) -> None:
+        """Who answers for the list of the map's districts is kept, also where a part of them is mirrored."""
+        told, publishers = root.lists.get(layer), self._publishers
+        if told is None or publishers is None or self._store.district_list(layer) == told:
+            return
+        signer = told.signature.signer
+        if not mirror_list(self._store, publishers, told, self._store.publisher_chain(signer) or self._chain(signer)):
+            why = "nobody of ours answers for it, or it is an older one than is here"
+            self.done.wrong[f"{layer}, list of districts"] = why
 
     def _keep_catalog(self, layer: str, index: ArchiveIndex) -> None:
         """Who answers for the catalog is kept where the whole district is here as it was signed."""
@@ -220,9 +232,3 @@ class _SeenInStore:
 
     def note(self, tile: TileId, seen: SeenVersion) -> None:
         """It is noted when it is put there."""
-
-
-def _touches(region: Region, district: District) -> bool:
-    if region.tiles is not None:
-        return any(tile.district == district for tile in region.tiles)
-    return district.path.startswith(region.prefix) or region.prefix.startswith(district.path)

@@ -11,6 +11,7 @@ from rich.console import Console
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.tile_store import tables
 from gnd.tile_store.catalogs import answered_catalogs, sign_whole_catalog
+from gnd.tile_store.district_lists import answered_list, sign_list
 from gnd.tile_store.errors import NotPublished
 from gnd.tile_store.location import LOCATION, StoreLocation, shown
 from gnd.tile_store.options import json_option, region_option, show, to_publish
@@ -32,7 +33,8 @@ def sign(path: StoreLocation, region: str, unchecked: bool, dry_run: bool, as_js
     are computed anew from their reports first, and signed where that gives the same, bit for bit. Bases and rollbacks
     of a revoked or foreign signer, and merges whose reports are gone, are signed with --unchecked alone. What was
     changed after it was signed is never signed; roll it back, or import it again. Then the catalogs of districts for
-    which nobody answers, or that name other versions than are there (--unchecked). Ends with 1 where something is left.
+    which nobody answers, or that name other versions than are there (--unchecked), and the lists of districts. Ends
+    with 1 where something is left.
     """
     with to_publish(path) as store:
         if store.signing is None:
@@ -56,7 +58,7 @@ def sign(path: StoreLocation, region: str, unchecked: bool, dry_run: bool, as_js
 
 
 def _catalogs(store: SqlStore, region: str, *, unchecked: bool, dry_run: bool) -> tuple[int, list[dict[str, str]]]:
-    """Sign the catalogs for which nobody answers: how many, and of those that are left why."""
+    """Sign the catalogs and lists of districts for which nobody answers: how many, and of those that are left why."""
     assert store.signing is not None
     publishers, signed, left = store.signing.publishers, 0, list[dict[str, str]]()
     for layer in store.layers():
@@ -65,6 +67,12 @@ def _catalogs(store: SqlStore, region: str, *, unchecked: bool, dry_run: bool) -
             why = "" if dry_run else sign_whole_catalog(store, layer, one.district, unchecked=unchecked)
             signed += not why
             left += [{"layer": layer, "district": one.district.path, "left_because": why}] if why else []
+    for layer in store.layers():
+        if answered_list(store, publishers, layer).status == GOOD:
+            continue
+        why = "" if dry_run else sign_list(store, layer, unchecked=unchecked)
+        signed += not why
+        left += [{"layer": layer, "district": "(the list of districts)", "left_because": why}] if why else []
     return signed, left
 
 

@@ -83,6 +83,7 @@ def verify(
 def _signatures(path: StoreLocation, layer: str, region: str, all_versions: bool, as_json: bool) -> None:
     """Say who answers for the versions of a region."""
     from gnd.tile_store.catalogs import answered_catalogs
+    from gnd.tile_store.district_lists import answered_list
     from gnd.tile_store.signatures import GOOD
     from gnd.tile_store.signatures import signatures as answered
 
@@ -90,25 +91,31 @@ def _signatures(path: StoreLocation, layer: str, region: str, all_versions: bool
         publishers = authority_of_environment()
         found = list(answered(store, publishers, layer, region, all_versions=all_versions))
         catalogs = list(answered_catalogs(store, publishers, layer, region))
+        listed = answered_list(store, publishers, layer)
     by = Counter(one.who if one.status == GOOD else one.status for one in found)
     wrong = [asdict(one) | {"tile": one.tile.path} for one in found if one.status != GOOD]
     signed = {who: n for who, n in sorted(by.items()) if any(one.who == who for one in found)}
     others = {status: n for status, n in sorted(by.items()) if status not in signed}
     values: dict[str, Any] = {"versions": len(found), "signed_by": signed, "not_answered_for": others, "wrong": wrong}
-    told = {"versions": len(found), **{f"signed by {who}": n for who, n in signed.items()}, **others}
+    told: dict[str, int | str] = {"versions": len(found)}
+    told |= {f"signed by {who}": n for who, n in signed.items()} | others
     by_status = Counter(one.status for one in catalogs)
     wrong_catalogs = [asdict(one) | {"district": one.district.path} for one in catalogs if one.status != GOOD]
     values |= {"catalogs": dict(by_status), "wrong_catalogs": wrong_catalogs}
     told |= {f"catalogs, {status}": n for status, n in sorted(by_status.items())}
+    values |= {"list": asdict(listed)}
+    told |= {"list of districts": listed.status}
 
     def print_it(console: Console) -> None:
         _print(console, f"{shown(path)}, layer {layer}", told, wrong)
         for one in wrong_catalogs[:20]:
             line = f"catalog of district {one['district']} {one['status']}: {one['why']}"
             console.print(line, highlight=False, soft_wrap=True)
+        if listed.status != GOOD:
+            console.print(f"list of districts {listed.status}: {listed.why}", highlight=False, soft_wrap=True)
 
     show(values, as_json, print_it)
-    if wrong or wrong_catalogs:
+    if wrong or wrong_catalogs or listed.status != GOOD:
         raise SystemExit(1)
 
 

@@ -5,7 +5,7 @@ import posixpath
 from dataclasses import dataclass
 
 from gnd.gnd_map.errors import GndError, RegionError
-from gnd.gnd_map.tile_id import TileId, covering_circle
+from gnd.gnd_map.tile_id import District, TileId, covering_circle
 
 MAX_RADIUS_M = 20_000.0
 
@@ -37,6 +37,12 @@ class Region:
     def __contains__(self, tile: TileId) -> bool:
         """Tell whether a tile belongs to the region."""
         return tile.path.startswith(self.prefix) if self.tiles is None else tile in self.tiles
+
+    def touches(self, district: District) -> bool:
+        """Tell whether the region has tiles in a district."""
+        if self.tiles is not None:
+            return any(tile.district == district for tile in self.tiles)
+        return district.path.startswith(self.prefix) or self.prefix.startswith(district.path)
 
 
 def parse_region(text: str) -> Region:

@@ -16,6 +16,14 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import limits
 from gnd.schemas.archive_seal import DIGEST_BYTES, Sealed, without_seal
 from gnd.schemas.catalog_signature import CatalogSignature, catalog_signature_message, decode_catalog_signature
+from gnd.schemas.district_list import (
+    DistrictList,
+    decode_district_list,
+    district_list_message,
+    district_of,
+    steps_of,
+    sums,
+)
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import archive_index_pb2, archive_root_pb2
 from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
@@ -159,7 +167,7 @@ class ArchiveIndex:
             district=self.district.path,
             packs=b"".join(pack.sha for pack in self.packs),
             pack_bytes=[pack.size_bytes for pack in self.packs],
-            places=_steps(places),
+            places=steps_of(places),
             versions=[entry.version for entry in self.entries],
             hashes=b"".join(entry.hash for entry in self.entries),
             signed=b"".join(entry.signed for entry in self.entries),
@@ -225,11 +233,14 @@ class ArchiveRoot:
         districts: of each layer.
         digests: how the index of each district is named, by layer in the order of `districts`; empty: not told.
         sealed: its seal, of one that was read; None: nobody answers for it.
+        lists: which districts the map has, by layer, as a publisher has signed it; not part of what is compared: it
+            is signed again where nothing has changed.
     """
 
     districts: Mapping[str, tuple[District, ...]] = field(default_factory=dict)
     digests: Mapping[str, tuple[bytes, ...]] = field(default_factory=dict)
     sealed: Sealed | None = field(default=None, compare=False)
+    lists: Mapping[str, DistrictList] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         for layer in self.districts:
@@ -255,8 +266,9 @@ class ArchiveRoot:
             major=MAJOR,
             layers=layers,
             counts=[len(some) for some in numbers],
-            districts=[step for some in numbers for step in _steps(some)],
+            districts=[step for some in numbers for step in steps_of(some)],
             digests=b"".join(one for layer in layers for one in self.digests.get(layer, ())),
+            lists=[district_list_message(self.lists[layer]) for layer in sorted(self.lists)],
         )
         return serialise(message, limits.MAX_ARCHIVE_ROOT_BYTES)
 
@@ -274,26 +286,16 @@ class ArchiveRoot:
             )
         parts = list(zip(layers, pairwise([0, *accumulate(counts)]), strict=True))
         digests = _cut("digests", message.digests, DIGEST_BYTES, sum(counts)) if message.digests else []
+        lists = {one.head.layer: one for one in map(decode_district_list, message.lists)}
+        if len(lists) != len(message.lists):
+            raise BadValue(f"ArchiveRoot with {len(message.lists)} lists of districts, of {len(lists)} layers")
         with refusing("ArchiveRoot"):
             return cls(
-                {layer: tuple(map(_district, _sums(message.districts[begin:end]))) for layer, (begin, end) in parts},
+                {layer: tuple(map(district_of, sums(message.districts[begin:end]))) for layer, (begin, end) in parts},
                 {layer: tuple(digests[begin:end]) for layer, (begin, end) in parts} if digests else {},
                 sealed,
+                lists,
             )
-
-
-def _district(number: int) -> District:
-    return TileId(number * _TILES).district
-
-
-def _sums(steps: Sequence[int]) -> list[int]:
-    if any(step == 0 for step in steps[1:]):
-        raise BadValue("a district twice")
-    return list(accumulate(steps))
-
-
-def _steps(numbers: Sequence[int]) -> list[int]:
-    return [*numbers[:1], *(after - before for before, after in pairwise(numbers))]
 
 
 def _cut(what: str, data: bytes, each: int, count: int) -> list[bytes]:

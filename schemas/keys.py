@@ -49,6 +49,13 @@ KEY_TABLE: Final = (
         reliability="repeated until answered; a wildcard gets one reply per district",
     ),
     KeySpec(
+        pattern=f"{ROOT}/catalog/<layer>/<region>",
+        kind="query on <region> = *, any client → tile server",
+        request="nothing; one byte 1: without the districts",
+        reply="DistrictList",
+        reliability="repeated until answered; one reply of each store that shares the map",
+    ),
+    KeySpec(
         pattern=f"{ROOT}/change/<layer>/<q5>/<q10>/<q15>",
         kind="query with payload, agent → merger shard",
         request="ChangeReport",
@@ -144,6 +151,23 @@ def catalog_key(layer: str, district: District) -> str:
 def catalog_keys(layer: str, prefix: str = "") -> str:
     """The catalogs of a region; `prefix` = none to three chunks of a tile's path (a fourth is left out)."""
     return f"{ROOT}/catalog/{_layer(layer)}/{_region('/'.join(prefix.split('/')[:3]))}"
+
+
+def list_key(layer: str, region: str) -> str:
+    """Where the list of districts of a store's part of a layer is answered."""
+    return f"{ROOT}/catalog/{_layer(layer)}/{_matching('region', region, VEHICLE_PATTERN)}"
+
+
+def list_keys(layer: str) -> str:
+    """Where the lists of districts of a layer are asked for."""
+    return f"{ROOT}/catalog/{_layer(layer)}/*"
+
+
+def layer_of_lists(key: str) -> str | None:
+    """The layer of a question after lists of districts; None: it is no such key."""
+    chunks = key.split("/")
+    is_one = len(chunks) == 5 and key.startswith(f"{ROOT}/catalog/") and chunks[4] == "*"
+    return chunks[3] if is_one and LAYER_PATTERN.fullmatch(chunks[3]) else None
 
 
 def district_keys(district: District) -> tuple[str, str, str]:
@@ -249,6 +273,12 @@ def parse_batch_key(key: str) -> tuple[str, District]:
 def parse_catalog_key(key: str) -> tuple[str, District]:
     """Layer and district of a catalog key; `BadKey`, `WrongVersion`."""
     return _layer_and_district(key, "catalog")
+
+
+def parse_list_key(key: str) -> tuple[str, str]:
+    """Layer and region of the key of a list of districts; `BadKey`, `WrongVersion`."""
+    layer, region = _chunks(key, "catalog", 2)
+    return _layer(layer), _matching("region", region, VEHICLE_PATTERN)
 
 
 def parse_change_key(key: str) -> tuple[str, District]:

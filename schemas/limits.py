@@ -37,6 +37,7 @@ MAX_PACK_BYTES: Final = 16 * MIB
 MAX_PACKS_OF_DISTRICT: Final = 256
 MAX_DISTRICTS_OF_ARCHIVE: Final = 250_000
 MAX_ARCHIVE_ROOT_BYTES: Final = 8 * MIB
+MAX_DISTRICT_LIST_BYTES: Final = 2 * MIB
 # Fields on the top level of a report: its tiles and its own, with room for a newer minor version's.
 MAX_REPORT_FIELDS: Final = MAX_TILES_OF_DISTRICT + 64
 # Fields on the top level of a reply about a district's tiles: five values a tile at most, with room.

@@ -10,6 +10,9 @@ import logging
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -18,62 +21,140 @@ from gnd.fleet_bus.identity.lists import replace_file
 from gnd.fleet_bus.publishers import Publishers
 from gnd.schemas.archive import ROOT_NAME, ArchiveIndex, ArchiveRoot, index_name
 from gnd.schemas.archive_seal import Sealed, SealNumber, digest_of_index
-from gnd.tile_client.errors import ArchiveAway, ArchiveStale, ArchiveWrong
+from gnd.tile_client.errors import ArchiveAway, ArchiveStale, ArchiveWrong, SeenDamaged
 
 if TYPE_CHECKING:
     from gnd.tile_client.archive import Archive
 
 SEEN_FILE: Final = "archives_seen.json"
-MOST_SEEN: Final = 4096
+CATALOGS_SEEN_FILE: Final = "catalogs_seen.json"
+MOST_SEEN: Final = 65_536
+MOST_SEEN_BYTES: Final = 16 * 1024 * 1024
 _LOG: Final = logging.getLogger(__name__)
 
 
 class SeenStates:
     """The newest state of each object that was seen, in a file; safe in several threads.
 
-    A file that cannot be read counts as none, one that cannot be written is told of once: neither stops anybody.
+    The file is replaced as a whole; several processes may have the same one. One that cannot be read, or was damaged,
+    is laid aside, told of, and counts as none; one that cannot be written is told of once: neither stops anybody.
 
     Args:
         path: of the file; it need not be there. None: nothing outlives the process.
     """
 
     def __init__(self, path: Path | None = None) -> None:
-        self._path, self._lock = path, threading.Lock()
+        self._path, self._lock = path, threading.RLock()
         self._seen = OrderedDict[str, SealNumber]()
-        if path is None:
-            return
-        try:
-            told = json.loads(path.read_bytes())
-            self._seen.update((str(name), SealNumber(int(at_s), int(number))) for name, (at_s, number) in told.items())
-        except FileNotFoundError:
-            pass
-        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            _LOG.warning("%s is not read, so an older state of an archive is not noticed: %s", path, error)
+        self._together, self._is_new = 0, False
+        if path is not None:
+            self._read(path)
 
     def newest(self, name: str) -> SealNumber:
         """The newest state of an object; the earliest there is where none was seen."""
         with self._lock:
             return self._seen.get(name, SealNumber())
 
+    def names(self, prefix: str) -> set[str]:
+        """The objects that were seen whose names begin so."""
+        with self._lock:
+            return {name for name in self._seen if name.startswith(prefix)}
+
     def note(self, name: str, order: SealNumber) -> None:
         """This state was seen; nothing where a newer one was."""
         with self._lock:
             if order <= self._seen.get(name, SealNumber()):
                 return
-            self._seen[name] = order
-            self._seen.move_to_end(name)
-            while len(self._seen) > MOST_SEEN:
-                self._seen.popitem(last=False)
-            if self._path is not None:
-                self._write(self._path)
+            self._take(name, order)
+            self._is_new = True
+            if not self._together:
+                self._write()
 
-    def _write(self, path: Path) -> None:
-        told = {name: (one.signed_s, one.number) for name, one in self._seen.items()}
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """What is noted inside, in this thread or another, is written once, at the end."""
+        with self._lock:
+            self._together += 1
         try:
-            replace_file(path, json.dumps(told).encode())
+            yield
+        finally:
+            with self._lock:
+                self._together -= 1
+                if not self._together and self._is_new:
+                    self._write()
+
+    def _take(self, name: str, order: SealNumber) -> None:
+        self._seen[name] = max(order, self._seen.get(name, SealNumber()))
+        self._seen.move_to_end(name)
+        while len(self._seen) > MOST_SEEN:
+            self._seen.popitem(last=False)
+
+    def _read(self, path: Path) -> None:
+        try:
+            for name, order in seen_of(path.read_bytes()).items():
+                self._take(name, order)
+        except FileNotFoundError:
+            pass
+        except SeenDamaged as error:
+            aside = path.with_name(f"{path.name}.damaged")
+            with suppress(OSError):
+                path.replace(aside)
+            _LOG.warning(
+                "%s is not what was written: %s; it counts as nothing seen, so an older state that somebody shows now"
+                " is not noticed; laid aside as %s",
+                path,
+                error,
+                aside.name,
+            )
+        except OSError as error:
+            _LOG.warning("%s is not read, so an older state is not noticed: %s", path, error)
+
+    def _write(self) -> None:
+        self._is_new, path = False, self._path
+        if path is None:
+            return
+        self._read(path)  # what another process has seen meanwhile
+        try:
+            replace_file(path, bytes_of_seen(self._seen))
         except OSError as error:
             self._path = None
-            _LOG.warning("which states of archives were seen is not kept in %s: %s", path, error)
+            _LOG.warning("which states were seen is not kept in %s: %s", path, error)
+
+
+def bytes_of_seen(seen: Mapping[str, SealNumber]) -> bytes:
+    """The states as a file holds them: JSON, with a checksum."""
+    told = {name: [one.signed_s, one.number] for name, one in seen.items()}
+    return json.dumps({"sha256": _checksum(told), "states": told}).encode()
+
+
+def seen_of(data: bytes) -> dict[str, SealNumber]:
+    """The states in a file.
+
+    Raises:
+        SeenDamaged: it is none, or was changed.
+    """
+    if len(data) > MOST_SEEN_BYTES:
+        raise SeenDamaged(f"{len(data)} bytes, at most {MOST_SEEN_BYTES}")
+    try:
+        told = json.loads(data)
+        states = told["states"] if "sha256" in told else told  # releases before wrote the states alone
+        found = {str(name): _state(*one) for name, one in states.items()}
+        is_whole = states is told or told["sha256"] == _checksum(states)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise SeenDamaged(f"{len(data)} bytes are no states: {error}") from error
+    if not is_whole:
+        raise SeenDamaged(f"the checksum of its {len(found)} states does not fit")
+    return found
+
+
+def _state(signed_s: int, number: int) -> SealNumber:
+    if not (type(signed_s) is type(number) is int and 0 <= signed_s < 2**48 and 0 <= number < 2**48):
+        raise SeenDamaged(f"a state with time {signed_s!r} and number {number!r}: 0 .. {2**48 - 1}")
+    return SealNumber(signed_s, number)
+
+
+def _checksum(states: object) -> str:
+    return sha256(json.dumps(states, sort_keys=True).encode()).hexdigest()
 
 
 class ArchiveCheck:

@@ -5,6 +5,7 @@ GndError
     ├── ArchiveAway       nobody answers, or not in time; another try may help
     └── ArchiveWrong      what came is not what it should be: too long, cut off, of another tile, not signed
         └── ArchiveStale  what came was right once; another try helps where a cache was behind
+└── SeenDamaged           a file of what was seen is not what was written
 """
 
 from gnd.gnd_map.errors import GndError
@@ -24,3 +25,7 @@ class ArchiveWrong(ArchiveError):
 
 class ArchiveStale(ArchiveWrong):
     """What came is an older state than another part of the archive names."""
+
+
+class SeenDamaged(GndError):
+    """A file of which states were seen is none, or was changed."""

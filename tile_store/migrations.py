@@ -36,6 +36,7 @@ STEPS: Final = (
     (17, "schema_of_body_checks"),
     (18, "schema_of_districts"),
     (19, "schema_of_catalogs"),
+    (20, "schema_of_lists"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 _TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks", "copy_notes_", "moved_away_",

@@ -11,7 +11,7 @@ mirror can neither mix states nor pass an older one off as a newer one.
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -39,6 +39,7 @@ from gnd.schemas.archive import (
 )
 from gnd.schemas.archive_seal import ARCHIVE_ID_BYTES, Sealed, SealedPart, digest_of_index, with_seal
 from gnd.schemas.catalog_signature import CatalogSignature, CatalogStatement
+from gnd.schemas.district_list import DistrictList
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.limits import MAX_ARCHIVE_INDEX_BYTES, MAX_ARCHIVE_ROOT_BYTES, MAX_PACK_BYTES
 from gnd.schemas.tile_answer import ANSWER_HASH_BYTES
@@ -148,7 +149,7 @@ def publish(
             for place, (district, some) in enumerate(listed, 1):
                 writing.district(layer, district, some, done)
                 progress(layer, place, len(listed))
-        writing.root(done)
+        writing.root(done, layers)
     return done
 
 
@@ -272,8 +273,10 @@ class _Writing:
         self._put_certificate(seal.signer, chain)
         return with_seal(part, body, seal, limit)
 
-    def root(self, done: Published) -> None:
-        """Name the districts that have an index: where that has changed; who signs says each time what holds now."""
+    def root(self, done: Published, layers: Sequence[str]) -> None:
+        """Name the districts that have an index: where that has changed; who signs says each time what holds now. With
+        the lists of districts as they are signed, of layers that were not looked at as they were published.
+        """
         places = sorted(place_of_index(one.name) for one in self._objects.each(INDEX_FOLDER))
         digests = dict[str, tuple[bytes, ...]]()
         if self._signing is not None:
@@ -282,11 +285,32 @@ class _Writing:
             places = list(found)
         districts = {layer: tuple(one for _, one in some) for layer, some in _by_layer(places).items()}
         before = self._root.sealed
-        data = self._sealed("root", ArchiveRoot(districts, digests).encode(), before, MAX_ARCHIVE_ROOT_BYTES)
+        root = ArchiveRoot(districts, digests, lists=self._lists(layers, districts))
+        data = self._sealed("root", root.encode(), before, MAX_ARCHIVE_ROOT_BYTES)
         if self._root_data != data:
             self._put(ROOT_NAME, data, done, changes=True)
         if self._signing is not None:
             done.number = 1 if before is None else before.seal.number + 1
+
+    def _lists(self, layers: Sequence[str], districts: Mapping[str, object]) -> dict[str, DistrictList]:
+        """The signed lists of districts, the certificates beside them; one that is not as it was signed is left out."""
+        found = {layer: one for layer, one in self._root.lists.items() if layer not in layers}
+        for layer in layers:
+            told = self._store.district_list(layer)
+            if told is None:
+                continue
+            chain = self._store.publisher_chain(told.signature.signer)
+            try:
+                if self._signing is not None:
+                    self._signing.publishers.learn(chain or b"")
+                    signed = told.signature
+                    self._signing.publishers.check(signed.signer, signed.signed_s, told.text, signed.signature)
+            except SealError as error:
+                _LOG.warning("the list of districts of layer %s is not published: %s", layer, error)
+                continue
+            self._put_certificate(told.signature.signer, chain)
+            found[layer] = told
+        return {layer: one for layer, one in found.items() if layer in districts}
 
     def _digest(self, layer: str, district: District) -> bytes:
         """How an index is named: as it was looked at now, or else as the root names it; only else it is read. Empty: it

@@ -21,6 +21,7 @@ from gnd.gnd_map.content import FEATURE_CODECS
 from gnd.gnd_map.errors import TileError
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import keys
+from gnd.schemas.district_list import HEAD_ONLY
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.limits import MAX_TILES_OF_DISTRICT
 from gnd.schemas.tiles import TileRequest
@@ -229,7 +230,12 @@ class TileServer:
         return replace(reply, others=tuple(still)).encode()
 
     def catalogs(self, request: Request) -> Answer:
-        """The catalog of an exact key's district (it may be empty), or of each district with tiles in a region."""
+        """The catalog of an exact key's district (it may be empty), or of each district with tiles in a region; or the
+        list of a layer's districts.
+        """
+        layer_of_list = keys.layer_of_lists(request.key)
+        if layer_of_list is not None:
+            return self._lists(layer_of_list, request.payload)
         try:
             if not request.is_wild:
                 layer, district = keys.parse_catalog_key(request.key)
@@ -267,6 +273,13 @@ class TileServer:
                 catalog = self._catalog(layer, district)
                 if self._is_owned(district):
                     yield keys.catalog_key(layer, district), catalog
+
+    def _lists(self, layer: str, payload: bytes) -> list[tuple[str, bytes]]:
+        told = self._store.district_list(layer)
+        if told is None:
+            return []
+        said = told.without_districts if payload == HEAD_ONLY else told
+        return [(keys.list_key(layer, told.head.region), said.encode())]
 
     def _catalog(self, layer: str, district: District) -> bytes:
         return self._store.catalog(layer, district).encode()

@@ -15,6 +15,7 @@ from gnd.fleet_bus.publishers import PublisherKey, Publishers
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.archive_seal import ArchiveSeal, Sealed, SealedPart, SealNumber, sealed_text
 from gnd.schemas.catalog_signature import CatalogKind, CatalogSignature, CatalogStatement
+from gnd.schemas.district_list import DistrictsHead, DistrictsSignature
 from gnd.schemas.version_signature import VersionSignature, VersionStatement
 from gnd.tile_store.connection import SqlConnection, change, fetch, post
 from gnd.tile_store.errors import NotPublished, StoreDamaged
@@ -77,6 +78,25 @@ class Signing:
         except IdentityError as error:
             raise NotPublished(f"no catalog can be signed, and so nothing published: {error}") from error
         return CatalogSignature(order.number, order.signed_s, kind, signer, signature), chain
+
+    def sign_districts(
+        self, head: DistrictsHead, before: DistrictsSignature | None
+    ) -> tuple[DistrictsSignature, bytes]:
+        """The signature under a list of districts, and the certificates behind it.
+
+        Args:
+            head: what is signed.
+            before: the signature under the list that it replaces.
+
+        Raises:
+            NotPublished: the certificate of this process has ended.
+        """
+        order = _next(None if before is None else before.order)
+        try:
+            signer, signature, chain = self._key.sign(lambda signer: head.text(order, signer), order.signed_s)
+        except IdentityError as error:
+            raise NotPublished(f"no list of districts can be signed, and so nothing published: {error}") from error
+        return DistrictsSignature(order.number, order.signed_s, signer, signature), chain
 
     def seal(
         self, part: SealedPart, body: bytes, archive: bytes, before: ArchiveSeal | None

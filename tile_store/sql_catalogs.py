@@ -29,6 +29,7 @@ from gnd.schemas.catalog_signature import (
 )
 from gnd.schemas.errors import BadValue
 from gnd.schemas.tiles import Catalog, CatalogEntry
+from gnd.tile_store import sql_district_lists as lists
 from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.connection import Row, SqlConnection, change, fetch, post
 from gnd.tile_store.errors import NotPublished
@@ -143,6 +144,8 @@ def changing(
         digests=with_group(statement.digests, group_of(tile), digest_of_rows(has)),
     )
     put(c, signing, after, kind, before)
+    if before is None:
+        lists.add(c, signing, layer, tile.district)
 
 
 def _is_there(before: CatalogState, tile: TileId, had: Sequence[_Released]) -> bool:

@@ -13,11 +13,13 @@ from typing import Any, Final, Protocol, Self, TypeVar
 
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District, TileId
+from gnd.schemas.district_list import DistrictList
 from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.tile_store import borders, clocks
 from gnd.tile_store import sql_accounts as accounts
 from gnd.tile_store import sql_catalogs as catalogs
 from gnd.tile_store import sql_confirmation as confirmation
+from gnd.tile_store import sql_district_lists as lists
 from gnd.tile_store import sql_inbox as inbox
 from gnd.tile_store import sql_journal as journal
 from gnd.tile_store import sql_refuted as refuted
@@ -753,6 +755,11 @@ class SqlStore(ABC):
         """See `Store.catalog`."""
         with self._readers.snapshot() as c:
             return catalogs.catalog_of(c, layer, district)
+
+    def district_list(self, layer: str) -> DistrictList | None:
+        """See `Store.district_list`."""
+        with self._readers.snapshot() as c:
+            return lists.list_of(c, layer)
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """See `Store.heads`."""

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.district_list import DistrictList
 from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.tile_store.districts import DistrictOwners
 from gnd.tile_store.roads import RoadPart
@@ -354,6 +355,9 @@ class Store(Protocol):
         """The newest released versions of a district's tiles, with the signature of who answers for all of them, as
         they are at one instant.
         """
+
+    def district_list(self, layer: str) -> DistrictList | None:
+        """Which districts a layer has, as a publisher has signed it; None: nobody has."""
 
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """The newest versions of a region's tiles (a prefix of their path), sorted by tile."""

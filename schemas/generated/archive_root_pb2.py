@@ -23,15 +23,16 @@ _sym_db = _symbol_database.Default()
 
 
 from . import archive_seal_pb2 as gnd_dot_v1_dot_archive__seal__pb2
+from . import district_list_pb2 as gnd_dot_v1_dot_district__list__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19gnd/v1/archive_root.proto\x12\x06gnd.v1\x1a\x19gnd/v1/archive_seal.proto\"\x83\x01\n\x0b\x41rchiveRoot\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0e\n\x06layers\x18\x02 \x03(\t\x12\x0e\n\x06\x63ounts\x18\x03 \x03(\r\x12\x11\n\tdistricts\x18\x04 \x03(\x04\x12\x0f\n\x07\x64igests\x18\x05 \x01(\x0c\x12!\n\x04seal\x18\x06 \x01(\x0b\x32\x13.gnd.v1.ArchiveSealb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19gnd/v1/archive_root.proto\x12\x06gnd.v1\x1a\x19gnd/v1/archive_seal.proto\x1a\x1agnd/v1/district_list.proto\"\xa8\x01\n\x0b\x41rchiveRoot\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0e\n\x06layers\x18\x02 \x03(\t\x12\x0e\n\x06\x63ounts\x18\x03 \x03(\r\x12\x11\n\tdistricts\x18\x04 \x03(\x04\x12\x0f\n\x07\x64igests\x18\x05 \x01(\x0c\x12!\n\x04seal\x18\x06 \x01(\x0b\x32\x13.gnd.v1.ArchiveSeal\x12#\n\x05lists\x18\x07 \x03(\x0b\x32\x14.gnd.v1.DistrictListb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.archive_root_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_ARCHIVEROOT']._serialized_start=65
-  _globals['_ARCHIVEROOT']._serialized_end=196
+  _globals['_ARCHIVEROOT']._serialized_start=93
+  _globals['_ARCHIVEROOT']._serialized_end=261
 # @@protoc_insertion_point(module_scope)

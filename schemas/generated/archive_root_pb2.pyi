@@ -5,6 +5,7 @@ isort:skip_file
 
 from collections import abc as _abc
 from . import archive_seal_pb2 as _archive_seal_pb2
+from . import district_list_pb2 as _district_list_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -31,6 +32,7 @@ class ArchiveRoot(_message.Message):
     DISTRICTS_FIELD_NUMBER: _builtins.int
     DIGESTS_FIELD_NUMBER: _builtins.int
     SEAL_FIELD_NUMBER: _builtins.int
+    LISTS_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     digests: _builtins.bytes
@@ -55,6 +57,12 @@ class ArchiveRoot(_message.Message):
     def seal(self) -> _archive_seal_pb2.ArchiveSeal:
         """Who answers for all that comes before it in the file; the last field of the file. Missing: nobody does."""
 
+    @_builtins.property
+    def lists(self) -> _containers.RepeatedCompositeFieldContainer[_district_list_pb2.DistrictList]:
+        """Which districts the layers of the map have from which it was published, as a publisher has signed that; one a layer
+        at most, and none where nobody has. The archive may hold a part of them.
+        """
+
     def __init__(
         self,
         *,
@@ -64,10 +72,11 @@ class ArchiveRoot(_message.Message):
         districts: _abc.Iterable[_builtins.int] | None = ...,
         digests: _builtins.bytes = ...,
         seal: _archive_seal_pb2.ArchiveSeal | None = ...,
+        lists: _abc.Iterable[_district_list_pb2.DistrictList] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["seal", b"seal"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "digests", b"digests", "districts", b"districts", "layers", b"layers", "major", b"major", "seal", b"seal"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "digests", b"digests", "districts", b"districts", "layers", b"layers", "lists", b"lists", "major", b"major", "seal", b"seal"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

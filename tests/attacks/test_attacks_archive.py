@@ -1,6 +1,5 @@
 """A mirror of an archive that forges, cuts off, rolls back and never ends: a clear error, and nothing is lost."""
 
-import json
 import resource
 import shutil
 import time
@@ -435,7 +434,9 @@ def test_a_memory_of_archives_that_is_none_stops_nobody(scene: ArchiveScene, dat
     kept.write_bytes(data)
     scene.seen = SeenStates(kept)
     assert scene.fetch().fetched == 4
-    assert SeenStates(kept).newest(next(iter(json.loads(kept.read_bytes())))).number >= 1
+    again = SeenStates(kept)
+    assert again.newest(next(iter(again.names("")))).number >= 1
+    assert (kept.with_name("seen.json.damaged")).read_bytes() == data
 
 
 def test_a_folder_that_cannot_be_written_stops_nobody(scene: ArchiveScene) -> None:

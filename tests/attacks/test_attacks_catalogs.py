@@ -159,11 +159,12 @@ def test_attack_old_catalog_with_a_new_number_or_time(scene: VersionScene) -> No
         is_refused(scene, replace(said, signature=replace(said.signature, **changes)), "does not fit")  # type: ignore[arg-type]
 
 
-def test_attack_catalog_of_another_district(scene: VersionScene) -> None:
+def test_attack_catalog_of_another_district(scene: VersionScene, tmp_path: Path) -> None:
     """The signed catalog of another district, or its signature alone, under this district's key."""
     other = TileId(FIRST.morton + 1024)
-    scene.publish("operator", content(other, 5))
-    there = scene.store.catalog(LAYER, other.district)
+    with own_store(scene, tmp_path / "other.sqlite", "operator") as store:
+        store.put_tiles([content(other, 5)])
+        there = store.catalog(LAYER, other.district)
     is_refused(scene, there, f"is not in district {HOME}")
     is_refused(scene, replace(true_catalog(scene), signature=there.signature), "does not fit")
     is_refused(scene, replace(there, entries=()), "does not fit")

@@ -447,7 +447,7 @@ def test_attack_version_of_four_thousand_million(scene: VersionScene) -> None:
 def test_attack_catalog_that_lies(scene: VersionScene) -> None:
     """Its catalog names version 4,000,000,000 of a tile; a watcher refuses all of it, and does not miss the next true
     version for it. A version that a catalog names is still fetched before it is reported."""
-    tile, region = scene.tile(1), Region(prefix="")
+    tile, region = scene.tile(1), Region(prefix=FIRST.district.path)
     asking = TileServerClient(scene.watcher, LAYER, 10.0)
     follower = RegionFollower(scene.watcher, {LAYER: asking}, region, 0.0)
     try:
@@ -475,7 +475,7 @@ def test_attack_catalog_that_goes_back(scene: VersionScene, caplog: pytest.LogCa
     """Its catalog is a true one of before; who has seen a newer one refuses it by name, and who has only fetched the
     tile, or heard the shard's notice of it, notices and counts it."""
     tile, heard = scene.tile(1), scene.tile(2)
-    region, asking = Region(prefix=""), TileServerClient(scene.watcher, LAYER, 10.0)
+    region, asking = Region(prefix=FIRST.district.path), TileServerClient(scene.watcher, LAYER, 10.0)
     old = scene.store.catalog(LAYER, FIRST.district)
     scene.publish("shard", content(tile, 4))
     new_tile = scene.tile(3)

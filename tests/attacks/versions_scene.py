@@ -20,6 +20,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import keys
+from gnd.schemas.district_list import DistrictList
 from gnd.schemas.tiles import Catalog
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.version_signature import VersionSignature, VersionStatement
@@ -34,6 +35,7 @@ FIRST = TileId(497353963154 & ~1023)
 LAYER = "ndt"
 Alter = Callable[[TileId, TileAnswer], TileAnswer]
 AlterCatalog = Callable[[Catalog], Catalog]
+AlterLists = Callable[[DistrictList], list[DistrictList]]
 
 
 def content(tile: TileId, seed: int, count: int = 40) -> Tile:
@@ -59,6 +61,11 @@ class BrokenServer:
     store: SqliteStore
     alter: Alter | None = None
     alter_catalog: AlterCatalog | None = None
+    alter_lists: AlterLists | None = None
+    beside: Callable[[District, Catalog], Catalog | None] = lambda _district, said: said
+    """What it says of other districts; None: nothing."""
+    strange: dict[District, Catalog] = field(default_factory=dict)
+    """Of districts that its store has not."""
     chains: dict[str, bytes] = field(default_factory=dict)
     """What it shows for ids of certificates that the store has not."""
 
@@ -84,9 +91,25 @@ class BrokenServer:
         return TilesReply(tuple(self.alter(tile, answer) for tile, answer in pairs))
 
     def catalog(self, request: Request) -> list[tuple[str, bytes]]:
+        if keys.layer_of_lists(request.key):
+            return self.lists()
         true = self.store.catalog(LAYER, FIRST.district)
         said = true if self.alter_catalog is None else self.alter_catalog(true)
-        return [(keys.catalog_key(LAYER, FIRST.district), said.encode())]
+        others = sorted({head.tile.district for head in self.store.heads(LAYER)} - {FIRST.district})
+        told = (
+            {one: self.beside(one, self.store.catalog(LAYER, one)) for one in others}
+            | {FIRST.district: said}
+            | self.strange
+        )
+        named = ((keys.catalog_key(LAYER, district), one) for district, one in told.items())
+        asked = request.key.removesuffix("**")
+        return [(key, one.encode()) for key, one in named if one is not None and f"{key}/".startswith(asked)]
+
+    def lists(self) -> list[tuple[str, bytes]]:
+        true = self.store.district_list(LAYER)
+        assert true is not None
+        said = [true] if self.alter_lists is None else self.alter_lists(true)
+        return [(keys.list_key(LAYER, one.head.region), one.encode()) for one in said]
 
     def certificate(self, request: Request) -> bytes:
         name = request.key.rpartition("/")[2]

@@ -46,6 +46,7 @@ from gnd.schemas.generated import (
     catalog_pb2,
     change_ack_pb2,
     change_report_pb2,
+    district_list_pb2,
     report_question_pb2,
     report_states_pb2,
     tile_blob_pb2,
@@ -79,6 +80,7 @@ _MESSAGES: dict[str, type[Message]] = {
     "TilesRequest": tiles_request_pb2.TilesRequest,
     "TilesReply": tiles_reply_pb2.TilesReply,
     "Catalog": catalog_pb2.Catalog,
+    "DistrictList": district_list_pb2.DistrictList,
     "ArchiveIndex": archive_index_pb2.ArchiveIndex,
     "ArchiveRoot": archive_root_pb2.ArchiveRoot,
     "ChangeAck": change_ack_pb2.ChangeAck,
@@ -89,6 +91,7 @@ _FILES = {
     "TileRequest": "tiles", "TileBlob": "tiles", "TileReply": "tiles", "Catalog": "tiles",
     "TilesRequest": "tiles_batch", "TilesReply": "tiles_batch", "ChangeAck": "changes", "TileUpdate": "updates",
     "TrafficSample": "traffic", "ArchiveIndex": "archive", "ArchiveRoot": "archive",
+    "DistrictList": "district_list",
 }  # fmt: skip
 
 
@@ -263,12 +266,13 @@ MOST_RADIUS_M = 1_000.0
 _KEYS = (
     keys.tile_key("ndt", TILE), keys.update_key("ndt", TILE), keys.batch_key("ndt", TILE.district),
     keys.catalog_key("ndt", TILE.district), keys.change_key("ndt", TILE.district), keys.traffic_key("car-1"),
-    keys.state_key("car-1"), keys.alive_key("merger", "m1"), keys.tiles_key("ndt", "13033"), "gnd/v2/tile/ndt/**",
+    keys.state_key("car-1"), keys.list_key("ndt", "main"),
+    keys.alive_key("merger", "m1"), keys.tiles_key("ndt", "13033"), "gnd/v2/tile/ndt/**",
 )  # fmt: skip
 _PARSERS = (
     keys.parse_tile_key, keys.parse_update_key, keys.parse_batch_key, keys.parse_catalog_key, keys.parse_change_key,
     keys.parse_traffic_key, keys.parse_state_key, keys.parse_alive_key, keys.parse_tiles_key,
-    keys.parse_health_key,
+    keys.parse_health_key, keys.parse_list_key,
 )  # fmt: skip
 
 

@@ -70,6 +70,7 @@ EXCEPTIONS = {
     "gnd_map/codec/priors.py:unpack": "tables that are part of the program",
     "gnd_map/sight.py:read_out": NOT_BYTES,
     "schemas/catalog_signature.py:decode_catalog_signature": OF_TARGET,
+    "schemas/district_list.py:decode_district_list": OF_TARGET,
     "schemas/wire.py:parse": "inside of every target of a message",
     "tile_store/feature_io/stored.py:import_features": OF_TARGET,
     "tile_store/feature_io/stored.py:load_features": "a store, which has a target",

@@ -18,6 +18,7 @@ from gnd.schemas.archive import UNSIGNED, ArchiveEntry, ArchiveIndex, ArchiveRoo
 from gnd.schemas.catalog_signature import CatalogSignature
 from gnd.schemas.changes import ChangeAck, ChangeReport, TileChange
 from gnd.schemas.course import Course
+from gnd.schemas.district_list import DistrictList, DistrictsHead, DistrictsSignature
 from gnd.schemas.doubt import Doubt, DoubtReason
 from gnd.schemas.packed import PackedGaussians, PackedReport, digest_of
 from gnd.schemas.report_id import deterministic_report_id
@@ -151,6 +152,9 @@ NEXT = Tile(TILE, 4, snap(gaussians([-604, 7, 8], count=300), LATTICES["standard
 
 SIGNED = VersionSignature(b"signer-1", "merged", 1_764_000_000, 1_764_000_000, bytes(range(64)))
 SIGNED_LATER = VersionSignature(b"signer-2", "base", 1_763_000_000, 1_764_000_000, bytes(range(64, 128)))
+LIST_SIGNATURE = DistrictsSignature(7, 1_764_000_000, b"signer-1", bytes(range(64)))
+THREE_DISTRICTS = tuple(TILE.district.first_morton // 1024 + n for n in (0, 1, 300))
+DISTRICTS = DistrictList(DistrictsHead.of("ndt", "main", THREE_DISTRICTS), LIST_SIGNATURE, THREE_DISTRICTS)
 CATALOG_SIGNATURE = CatalogSignature(7, 1_764_000_000, "rollback", b"signer-1", bytes(range(64)))
 
 GOLDEN: dict[str, Any] = {
@@ -205,6 +209,10 @@ GOLDEN: dict[str, Any] = {
     "Catalog-empty": Catalog(),
     "Catalog-two_tiles": Catalog((CatalogEntry(TILE, 3, SHA), CatalogEntry(EAST, 2**32 - 1, OTHER_SHA))),
     "Catalog-signed": Catalog((CatalogEntry(TILE, 3, SHA),), CATALOG_SIGNATURE),
+    "DistrictList-three": DISTRICTS,
+    "DistrictList-head": DISTRICTS.without_districts,
+    "DistrictList-empty": DistrictList(DistrictsHead.of("lanes", "north-1", ()), LIST_SIGNATURE, ()),
+    "ArchiveRoot-lists": ArchiveRoot({"ndt": (TILE.district,)}, lists={"ndt": DISTRICTS}),
     "ChangeReport-two_tiles-with_and_without_base": report(),
     "ChangeReport-nothing_changed": report(tiles=(change(changed=Gaussians.empty()),)),
     "ChangeReport-nothing_observed": report(tiles=(change(changed=Gaussians.empty(), observed=np.empty(0, np.int32)),)),
@@ -343,6 +351,7 @@ KINDS: dict[str, Any] = {
         ArchiveIndex,
         ArchiveRoot,
         Catalog,
+        DistrictList,
         ChangeReport,
         ChangeAck,
         PackedReport,

@@ -44,6 +44,9 @@ def test_any_tile_is_read_back_from_its_keys(tile: TileId) -> None:
     assert keys.parse_update_key(keys.update_key("signs", tile)) == ("signs", tile)
     assert keys.parse_catalog_key(keys.catalog_key("ndt", tile.district)) == ("ndt", tile.district)
     assert keys.parse_change_key(keys.change_key("ndt", tile.district)) == ("ndt", tile.district)
+    assert keys.parse_list_key(keys.list_key("ndt", "main")) == ("ndt", "main")
+    assert keys.layer_of_lists(keys.list_keys("ndt")) == "ndt"
+    assert keys.layer_of_lists(keys.catalog_keys("ndt")) is keys.layer_of_lists(keys.list_key("ndt", "a")) is None
 
 
 @given(tiles, st.integers(0, 4))

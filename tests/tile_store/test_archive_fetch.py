@@ -25,6 +25,7 @@ from gnd.tile_client.checking import VersionCheck
 from gnd.tile_client.errors import ArchiveAway, ArchiveError, ArchiveWrong
 from gnd.tile_client.http_reader import HttpReader
 from gnd.tile_store.catalogs import answered_catalogs
+from gnd.tile_store.district_lists import answered_list
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.objects import FolderObjects
 from gnd.tile_store.publishing import prune, publish
@@ -77,6 +78,8 @@ def test_a_mirror_has_what_was_published_with_its_signatures(
             assert (ours.to_blob(), ours.signature) == (theirs.to_blob(), theirs.signature)
             assert mirror.catalog("ndt", tile.district) == store.catalog("ndt", tile.district)
         assert {one.status for one in answered_catalogs(mirror, Publishers(parts / "v1"), "ndt")} == {"good"}
+        assert mirror.district_list("ndt") == store.district_list("ndt") is not None
+        assert answered_list(mirror, Publishers(parts / "v1"), "ndt").status == "good"
 
 
 def test_a_mirror_is_brought_up_to_date_with_few_requests(

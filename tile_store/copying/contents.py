@@ -23,6 +23,7 @@ ALL: Final = (
     Contents("tile_version", _VERSION),
     Contents("tile_head", _TILE),
     Contents("catalog_state", _TILE),
+    Contents("district_list", ("layer",)),
     Contents("notice", _VERSION),
     Contents("report", ("arrival",)),
     Contents("journal", _TILE),
@@ -127,7 +128,7 @@ OF_DISTRICT: Final = (
 STAYS: Final = (
     "merge_parameters", "publisher", "shifted_vehicle", "quarantined_vehicle", "pardon", "vehicle_owner", "alone_day",
     "lone_word", "vehicle_group", "vehicle_place", "impossible_place", "trial_salt", "trial_steered", "road_part",
-    "road_work", "feature_source", "district_owner", "border_row", "body_place", "body_going",
-    "quarantine", "quarantine_size",
+    "road_work", "feature_source", "district_owner", "district_list", "border_row", "body_place",
+    "body_going", "quarantine", "quarantine_size",
 )  # fmt: skip
 """Tables of the whole store; `copying.district` says what a move tells the other store of them."""

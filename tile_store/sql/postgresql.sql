@@ -536,6 +536,18 @@ CREATE TABLE catalog_state (
 );
 CREATE INDEX catalog_state_signed ON catalog_state (layer, signed_s, signer);
 
+-- name: schema_of_lists
+-- Step 20, likewise.
+CREATE TABLE district_list (
+  layer     text COLLATE "C" NOT NULL PRIMARY KEY,
+  region    text COLLATE "C" NOT NULL,
+  districts bytea  NOT NULL CHECK (length(districts) % 8 = 0),
+  number    bigint NOT NULL CHECK (number > 0),
+  signed_s  bigint NOT NULL,
+  signer    bytea  NOT NULL CHECK (length(signer) = 8),
+  signature bytea  NOT NULL CHECK (length(signature) = 64)
+);
+
 -- name: store_lock
 SELECT store_lock(:store::integer, :alone <> 0, :parts::bigint[]::integer[])
 

@@ -1876,3 +1876,41 @@ SELECT 1 FROM tile_head WHERE layer = :layer AND tile >= :first AND tile < :end 
 
 -- name: newest_of_district
 SELECT tile, MAX(version) FROM tile_version WHERE layer = :layer AND tile >= :first AND tile < :end GROUP BY tile
+
+-- name: schema_of_lists
+-- Step of the schema. Which districts a layer has, as a publisher has signed it (`gnd.schemas.district_list`):
+-- `districts` holds their numbers (tile / 1024), ascending, 8 bytes each, little-endian.
+CREATE TABLE district_list (
+  layer     TEXT    NOT NULL PRIMARY KEY,
+  region    TEXT    NOT NULL,
+  districts BLOB    NOT NULL CHECK (length(districts) % 8 = 0),
+  number    INTEGER NOT NULL CHECK (number > 0),
+  signed_s  INTEGER NOT NULL,
+  signer    BLOB    NOT NULL CHECK (length(signer) = 8),
+  signature BLOB    NOT NULL CHECK (length(signature) = 64)
+) STRICT;
+
+-- name: district_list
+SELECT region, districts, number, signed_s, signer, signature FROM district_list WHERE layer = :layer
+
+-- name: number_of_list
+SELECT number FROM district_list WHERE layer = :layer
+
+-- name: insert_district_list
+INSERT INTO district_list (layer, region, districts, number, signed_s, signer, signature)
+VALUES (:layer, :region, :districts, :number, :signed_s, :signer, :signature)
+ON CONFLICT (layer) DO NOTHING
+
+-- name: swap_district_list
+UPDATE district_list SET region = :region, districts = :districts, number = :number, signed_s = :signed_s,
+  signer = :signer, signature = :signature
+WHERE layer = :layer AND number = :held
+
+-- name: region_of_store
+SELECT region FROM district_owner WHERE district = -1
+
+-- name: districts_moved_away
+SELECT district FROM district_owner WHERE district >= 0 AND state = 'moved'
+
+-- name: any_other_head
+SELECT 1 FROM tile_head WHERE layer = :layer AND (tile < :first OR tile >= :end) LIMIT 1
