@@ -19,6 +19,7 @@ from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
+from gnd.tile_client.archive_check import seen_beside
 from gnd.tile_client.fetching import TileServerClient
 from gnd.tile_client.following import NewVersion, RegionFollower
 from gnd.tile_client.notices import QueuedNotice
@@ -86,7 +87,8 @@ class TileWatch:
         self, bus: Bus, region: Region, emit: Callable[[WatchEvent], None], layers: Sequence[str] = (LAYER,)
     ) -> None:
         self._bus, self._region, self._emit = bus, region, emit
-        self._asking = {layer: TileServerClient(bus, layer, CATALOG_TIMEOUT_S) for layer in layers}
+        seen = seen_beside(bus.config.identity)
+        self._asking = {layer: TileServerClient(bus, layer, CATALOG_TIMEOUT_S, seen=seen) for layer in layers}
         self._seen: set[tuple[str, TileId, int]] = set()
 
     def run(self, stop: threading.Event) -> None:

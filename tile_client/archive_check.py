@@ -121,6 +121,11 @@ class SeenStates:
             _LOG.warning("which states were seen is not kept in %s: %s", path, error)
 
 
+def seen_beside(identity: Path | None) -> SeenStates:
+    """What programs with an identity remember of catalogs and lists of districts, next to it; without one: nothing."""
+    return SeenStates(None if identity is None else identity / CATALOGS_SEEN_FILE)
+
+
 def bytes_of_seen(seen: Mapping[str, SealNumber]) -> bytes:
     """The states as a file holds them: JSON, with a checksum."""
     told = {name: [one.signed_s, one.number] for name, one in seen.items()}

@@ -44,25 +44,25 @@ class CatalogCheck:
         self._publishers, self._layer, self._oldest_s = publishers, layer, oldest_s
         self._seen = SeenStates() if seen is None else seen
 
-    def check(self, layer: str, district: District, catalog: Catalog) -> None:
-        """Take note of the catalog that came under the key of a layer and a district.
+    def check(self, layer: str, district: District, catalog: Catalog) -> float:
+        """Take note of the catalog that came under the key of a layer and a district; how long ago it was signed, s.
 
         Raises:
             NotSigned: it is not to be used; why. It is counted (`gnd_refusals`, kind "catalog").
         """
         try:
-            self._check(layer, district, catalog)
+            return self._check(layer, district, catalog)
         except _RefusedCatalogError as refused:
             counted("catalog", refused.reason)
             raise NotSigned(f"catalog of district {district} of layer {self._layer}: {refused}") from refused
 
-    def _check(self, layer: str, district: District, catalog: Catalog) -> None:
+    def _check(self, layer: str, district: District, catalog: Catalog) -> float:
         if layer != self._layer:
             raise _RefusedCatalogError("wrong", f"is that of layer {layer[:40]}")
         newest, signed = self._seen.newest(self._name(district)), catalog.signature
         if signed is None:
             if not catalog.entries and newest == SealNumber():
-                return  # nothing is mapped there; who leaves a whole district out cannot be told from that
+                return 0.0  # nothing is mapped there, or the list of districts names it (`list_check`)
             raise _RefusedCatalogError(
                 "unsigned",
                 "nobody has signed it: the tile server or the shards may be of an older release (shards sign each"
@@ -77,9 +77,9 @@ class CatalogCheck:
             raise _RefusedCatalogError(error.why, f"{error}; {len(catalog.entries)} tiles are named") from error
         except SealError as error:
             raise _RefusedCatalogError("unknown", str(error)) from error
-        self._check_order(district, signed, newest)
+        return self._check_order(district, signed, newest)
 
-    def _check_order(self, district: District, signed: CatalogSignature, newest: SealNumber) -> None:
+    def _check_order(self, district: District, signed: CatalogSignature, newest: SealNumber) -> float:
         if signed.order < newest:
             raise _RefusedCatalogError(
                 "older",
@@ -113,6 +113,7 @@ class CatalogCheck:
                 newest.number,
             )
         self._seen.note(self._name(district), signed.order)
+        return age_s
 
     def _name(self, district: District) -> str:
         return f"{self._layer}/{district}"

@@ -18,7 +18,7 @@ from gnd.schemas.keys import batch_key, catalog_keys, parse_catalog_key
 from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.schemas.updates import TileUpdate
 from gnd.tile_client.archive_check import SeenStates
-from gnd.tile_client.catalog_check import CatalogCheck, set_back
+from gnd.tile_client.catalog_check import NOTICED_AFTER_S, CatalogCheck, set_back
 from gnd.tile_client.checking import SeenInMemory, VersionCheck
 from gnd.tile_client.exchange import Exchange, ExchangeOutcome, TilesInMemory
 from gnd.tile_client.list_check import KnownDistricts, ListCheck
@@ -43,6 +43,8 @@ class TileServerClient:
         seen: which states of catalogs and of lists of districts were seen before.
         check: of the versions that come: by the identity of the bus; None where it has none.
         refused: districts whose catalog was refused when it was last asked for, and why.
+        stale: districts whose catalog was signed more than `catalog_check.NOTICED_AFTER_S` before it was last asked
+            for, with its age, s.
         behind: tiles of which the last catalog names an older version than was seen, or none: see
             `catalog_check.set_back`.
     """
@@ -56,6 +58,7 @@ class TileServerClient:
     check: VersionCheck | None = field(init=False, repr=False)
     behind: dict[TileId, int | None] = field(init=False, repr=False, default_factory=dict)
     refused: dict[District, str] = field(init=False, repr=False, default_factory=dict)
+    stale: dict[District, float] = field(init=False, repr=False, default_factory=dict)
     _seen: SeenInMemory = field(init=False, repr=False, default_factory=SeenInMemory)
     _catalogs: CatalogCheck | None = field(init=False, repr=False, default=None)
     _lists: ListCheck | None = field(init=False, repr=False, default=None)
@@ -84,6 +87,7 @@ class TileServerClient:
         """
         keys, seen = catalog_keys(self.layer, region.prefix), self._seen.versions(region)
         self.refused.clear()
+        self.stale.clear()
         with self.seen.together():
             # first: it names no more than there is then
             listed = None if self._lists is None else self._lists.ask(self.bus, self.timeout_s)
@@ -107,11 +111,13 @@ class TileServerClient:
             return catalog.entries
         layer, district = parse_catalog_key(key)
         try:
-            self._catalogs.check(layer, district, catalog)
+            age_s = self._catalogs.check(layer, district, catalog)
         except NotSigned as error:
             self.refused[district] = str(error)
             _SELDOM.warning("%s", error)
             return None
+        if age_s > NOTICED_AFTER_S:
+            self.stale[district] = age_s
         return catalog.entries
 
     def _compare(self, listed: KnownDistricts, region: Region, found: dict[str, tuple[CatalogEntry, ...]]) -> None:

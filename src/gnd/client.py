@@ -7,6 +7,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from gnd.fleet_bus.bus import Bus, open_bus
@@ -16,11 +17,12 @@ from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.region import Region, as_region
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError, WrongHash
 from gnd.schemas.tiles import CatalogEntry
 from gnd.schemas.updates import updated
+from gnd.tile_client.archive_check import SeenStates, seen_beside
 from gnd.tile_client.fetching import TileServerClient
 from gnd.tile_client.following import NewVersion, RegionFollower
 
@@ -69,7 +71,11 @@ class MapUpdate:
 
 
 def connect(
-    router: str = DEFAULT_ENDPOINT, *, timeout_s: float = 10.0, oldest_catalog_s: float | None = None
+    router: str = DEFAULT_ENDPOINT,
+    *,
+    timeout_s: float = 10.0,
+    oldest_catalog_s: float | None = None,
+    seen: Path | None = None,
 ) -> "Client":
     """Join the bus as a client of a router; use it in a `with` block.
 
@@ -77,7 +83,9 @@ def connect(
         router: endpoint of the router.
         timeout_s: how long a router is looked for, and how long each question is asked again, s.
         oldest_catalog_s: with an identity, a catalog that was signed longer ago is refused, s (shards sign each again
-            once an hour); None: any age will do, and one of more than a day is told in the log.
+            once an hour); None: any age will do, and one of more than a day is told in the log and by `Client.stale`.
+        seen: with an identity, the file in which it is kept which catalogs and lists of districts were seen, so that
+            older ones are refused after a new start, too; None: `catalogs_seen.json` in the folder of the identity.
 
     Raises:
         NoRouter: nothing answers at `router` within `timeout_s`; the message says both.
@@ -85,13 +93,17 @@ def connect(
     """
     bus = open_bus(BusConfig(connect=(router,), open_timeout_s=timeout_s), name="client")
     follow_revoked(bus)
-    return Client(bus, timeout_s, oldest_catalog_s)
+    remembered = SeenStates(seen) if seen is not None and bus.config.identity else seen_beside(bus.config.identity)
+    return Client(bus, timeout_s, oldest_catalog_s, remembered)
 
 
 class Client:
     """Reads the map that a fleet keeps. Methods may be called from any thread. `connect` makes one."""
 
-    def __init__(self, bus: Bus, timeout_s: float, oldest_catalog_s: float | None = None) -> None:
+    def __init__(
+        self, bus: Bus, timeout_s: float, oldest_catalog_s: float | None = None, seen: SeenStates | None = None
+    ) -> None:
+        self._seen = SeenStates() if seen is None else seen
         self._bus, self._timeout_s, self._oldest_catalog_s = bus, timeout_s, oldest_catalog_s
         self._streams: list[UpdateStream] = []
         self._asked: dict[str, TileServerClient] = {}  # each remembers the newest versions that it has seen
@@ -122,6 +134,18 @@ class Client:
             NotSigned: with an identity: no publisher answers for the catalog of any district there, or it is too old.
         """
         return self._asking(layer).catalog(as_region(region))
+
+    def refused(self, *, layer: str = GAUSSIANS) -> dict[District, str]:
+        """Districts that the last answer to `catalog`, `tiles` or a subscription went without, and why: nobody answers
+        for them, they are older than was seen, or the signed list names them and they did not come.
+        """
+        return dict(self._asking(layer).refused)
+
+    def stale(self, *, layer: str = GAUSSIANS) -> dict[District, float]:
+        """Districts whose catalog was signed more than a day before the last answer, with its age, s: nobody has
+        confirmed for so long that there is no newer one. They are used.
+        """
+        return dict(self._asking(layer).stale)
 
     def tiles(self, region: AnyRegion = None, *, layer: str = GAUSSIANS) -> Iterator[AnyTile]:
         """The newest version of each tile of a region, by tile, as it arrives: `Tile` or, of features, `FeatureTile`.
@@ -190,7 +214,9 @@ class Client:
     def _asking(self, layer: str) -> TileServerClient:
         known = self._asked.get(layer)
         if known is None:
-            asking = TileServerClient(self._bus, layer, self._timeout_s, oldest_catalog_s=self._oldest_catalog_s)
+            asking = TileServerClient(
+                self._bus, layer, self._timeout_s, oldest_catalog_s=self._oldest_catalog_s, seen=self._seen
+            )
             known = self._asked.setdefault(layer, asking)
         return known
 

@@ -1,6 +1,10 @@
 """Attacks on which districts a client is told that there are: by a tile server that was broken into, by keys that do
 not count (any more), by who shows older states to somebody who was restarted."""
 
+import os
+import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,6 +23,7 @@ from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, TileId
 from gnd.schemas.district_list import DistrictList, DistrictsHead, DistrictsSignature
 from gnd.schemas.errors import NotSigned, SchemaError
 from gnd.schemas.tiles import Catalog
+from gnd.tile_client.archive_check import SeenStates
 from gnd.tile_client.fetching import TileServerClient
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -271,3 +276,82 @@ def test_attack_list_of_a_revoked_shard(scene: VersionScene) -> None:
             why = str(error)
     scene.server.beside = lambda _district, said: said
     is_refused(scene, signed_by(scene, gone, NUMBERS[:1], 1800.0), "was revoked")
+
+
+# ---- after a restart
+
+PROGRAM = """
+import sys, time, gnd
+with gnd.connect(sys.argv[1], timeout_s=20.0) as client:
+    try:
+        print("took", *(f"{one.version}" for one in client.catalog()), "refused", *client.refused().values(), flush=True)
+    except gnd.GndError as error:
+        print("refused", error, flush=True)
+    time.sleep(60.0)
+"""
+
+
+def program(scene: VersionScene, identity: Path) -> str:
+    """What a program of the API says of the map; it is killed (kill -9) as soon as it has said it."""
+    command = [sys.executable, "-c", PROGRAM, scene.endpoint]
+    env = os.environ | {"GND_IDENTITY": str(identity)}
+    with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        said = running.stdout.readline()
+        running.kill()
+    return said
+
+
+@pytest.mark.slow
+def test_attack_older_states_after_a_restart(scene: VersionScene, tmp_path: Path) -> None:
+    """A program is killed (kill -9) and started again; then an older catalog, or list, is shown to it, which a
+    publisher has signed: it knows from its disk that it has seen newer ones. Where somebody damages that file, it is
+    laid aside, and said to count as nothing seen."""
+    identity = tmp_path / "program"
+    shutil.copytree(scene.parts["watcher"], identity)
+    old_catalog, old_list = scene.store.catalog(LAYER, HOME), true_list(scene)
+    scene.publish("shard", content(FIRST, 7))
+    newer = signed_by(scene, scene.parts["shard"], NUMBERS, number=50)
+    scene.server.alter_lists = lambda _true: [newer]
+    assert program(scene, identity).startswith("took 2 1 refused")
+    scene.server.alter_catalog = lambda _true: old_catalog
+    assert "which was seen before" in program(scene, identity), "an older catalog of a district"
+    scene.server.alter_catalog, scene.server.alter_lists = None, lambda _true: [old_list]
+    said = program(scene, identity)
+    assert said.startswith("refused list of districts"), said
+    assert "which was seen before" in said
+    kept = identity / "catalogs_seen.json"
+    data = kept.read_bytes()
+    kept.write_bytes(data.replace(b"50]", b"10]"))
+    assert program(scene, identity).startswith("took 2 1"), "nothing counts as seen, and the map is read"
+    assert (identity / "catalogs_seen.json.damaged").read_bytes() == data.replace(b"50]", b"10]")
+    assert "which was seen before" not in program(scene, identity)
+
+
+WRITER = """
+import itertools, sys
+from pathlib import Path
+from gnd.schemas.archive_seal import SealNumber
+from gnd.tile_client.archive_check import SeenStates
+seen = SeenStates(Path(sys.argv[1]))
+for n in itertools.count(seen.newest("one").number + 1):
+    seen.note("one", SealNumber(1_795_000_000, n))
+    seen.note(f"other {n % 50}", SealNumber(1_795_000_000, n))
+    print(n, flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_what_was_seen_survives_kill_9_at_any_time(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, last = tmp_path / "seen.json", 0
+    for wait_s in (0.0, 0.003, 0.011, 0.05):
+        with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as running:
+            assert running.stdout is not None
+            said = [int(running.stdout.readline()) for _ in range(20)]
+            time.sleep(wait_s)
+            running.kill()
+            said += map(int, running.stdout.read().split())
+        assert said[0] > last, "it has gone on from what was seen"
+        last = said[-1]
+        assert SeenStates(path).newest("one").number >= last
+    assert caplog.text == ""
