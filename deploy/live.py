@@ -132,9 +132,10 @@ def renewed_text(use: MapUse | None) -> str:
 
 
 def doubts_text(sample: TrafficSample) -> str:
-    """Tiles in doubt ("4 tiles (2 held back)") and scans taken back; empty where there are none."""
+    """Tiles in doubt ("4 tiles (2 held back)"), scans taken back, a map that is stale; empty where there are none."""
     parts = [f"{sample.tiles_doubtful} tiles ({sample.tiles_held_back} held back)"] if sample.tiles_doubtful else []
     parts += [f"{sample.scans_taken_back} scans"] if sample.scans_taken_back else []
+    parts += [f"map not confirmed for {sample.map_stale_h} h"] if sample.map_stale_h else []
     return ", ".join(parts)
 
 

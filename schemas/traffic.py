@@ -79,6 +79,9 @@ class TrafficSample:
     doubts: tuple[int, ...] = ()
     """The same by reason, in the order of the bits of `DoubtReason`; missing ones at the end are 0."""
 
+    map_stale_h: int = 0
+    """Hours since the publishers of its map have confirmed it for the last time, where that is too long; else 0."""
+
     def __post_init__(self) -> None:
         check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
         check_text("health", self.health, WORD_PATTERN)
@@ -87,7 +90,7 @@ class TrafficSample:
         check_unsigned("wire_down_bytes", self.wire_down_bytes, bits=63)
         check_unsigned("tiles", self.tiles, bits=32)
         check_unsigned("reports", self.reports, bits=32)
-        for name in ("scans_taken_back", "tiles_held_back", "tiles_doubtful"):
+        for name in ("scans_taken_back", "tiles_held_back", "tiles_doubtful", "map_stale_h"):
             check_unsigned(name, getattr(self, name), bits=32)
         check_length("TrafficSample", len(self.doubts), _MAX_REASONS, "reasons of doubt")
         for tiles in self.doubts:
@@ -136,6 +139,7 @@ class TrafficSample:
             tiles_held_back=self.tiles_held_back,
             tiles_doubtful=self.tiles_doubtful,
             doubts=self.doubts,
+            map_stale_h=self.map_stale_h,
         )
         return serialise(message, limits.MAX_TRAFFIC_SAMPLE_BYTES)
 
@@ -160,6 +164,7 @@ class TrafficSample:
             tiles_held_back=m.tiles_held_back,
             tiles_doubtful=m.tiles_doubtful,
             doubts=tuple(m.doubts),
+            map_stale_h=m.map_stale_h,
         )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from gnd.deploy.fleet_identities import make_identities
 from studies.frame.measure import Figure
 from studies.security_study.kilometre import (
+    HEAD,
     KILOMETRE,
     KILOMETRE_APART,
     NAME_BYTES,
@@ -24,7 +25,7 @@ from studies.security_study.kilometre import (
 
 TIMES: Final = 30
 _WAYS: Final = (("plain", "tcp", False), ("seals", "tcp", True), ("seals and TLS", "tls", True))
-_ONE_OF_EACH: Final = tuple({one.what: one for one in reversed((*KILOMETRE, WORD))}.values())
+_ONE_OF_EACH: Final = tuple({one.what: one for one in reversed((*KILOMETRE, WORD, HEAD))}.values())
 _KILOMETRES: Final = {
     "a kilometre with a question a district": KILOMETRE_APART,
     "a kilometre": KILOMETRE,
@@ -34,6 +35,7 @@ _NAMES: Final = {
     "report": "a report and its acknowledgement",
     "word": "a word to the vehicle",
     "telemetry": "a sample of telemetry",
+    "head": "a question after the head of the list of districts and its answer",
 }
 
 
@@ -68,7 +70,7 @@ def run() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         identities = make_identities(Path(folder), 1, 1)
         costs = _costs(identities)
-    return [*_by_message(costs), *_by_kilometre(costs)]
+    return [*_by_message(costs), *_by_kilometre(costs), _head(costs)]
 
 
 def _costs(identities: Path) -> dict[str, _Cost]:
@@ -98,6 +100,12 @@ def _by_message(costs: dict[str, _Cost]) -> list[Figure]:
         added = f"seals add {seals - plain:.0f} B, TLS {tls - seals:.0f} B"
         found.append(Figure(f"{name}, beside the payload, plain", plain, "B", added))
     return found
+
+
+def _head(costs: dict[str, _Cost]) -> Figure:
+    """What a vehicle with an identity asks every six hours, and one without never."""
+    whole = costs["seals and TLS"].of["head"] + HEAD.up + HEAD.down
+    return Figure("every six hours: the head of the list of districts", whole, "B", f"{whole / 6:.0f} B an hour")
 
 
 def _by_kilometre(costs: dict[str, _Cost]) -> list[Figure]:

@@ -16,7 +16,7 @@ from gnd.fleet_bus.publishers import Publishers
 from gnd.fleet_bus.refusals import counted
 from gnd.fleet_bus.seldom import Seldom
 from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District
-from gnd.schemas.district_list import DistrictList, district_of
+from gnd.schemas.district_list import HEAD_ONLY, DistrictList, district_of
 from gnd.schemas.errors import NotSigned
 from gnd.schemas.keys import list_keys, parse_list_key
 from gnd.tile_client.archive_check import SeenStates
@@ -79,12 +79,25 @@ class ListCheck:
             self._known, self._until_s = known, time.monotonic() + LIST_KEPT_S
         return known
 
-    def check(self, replies: list[tuple[str, DistrictList]]) -> KnownDistricts:
-        """What lists say that came under their keys; see `ask`."""
+    def ask_head(self, bus: Bus, timeout_s: float) -> int:
+        """When the oldest of the layer's lists was signed, POSIX seconds; the districts are not sent.
+
+        Raises:
+            RequestFailed, NotSigned, SchemaError: as `ask`; NotSigned also where there is no list.
+        """
+        replies = bus.request_many(list_keys(self._layer), HEAD_ONLY, kind="catalog", timeout_s=timeout_s)
+        told = [(key, DistrictList.decode(payload)) for key, payload in replies]
+        signed_s = self.check(told, heads=True).signed_s
+        if not signed_s:
+            raise NotSigned(f"list of districts of layer {self._layer}: nobody has signed one")
+        return signed_s
+
+    def check(self, replies: list[tuple[str, DistrictList]], *, heads: bool = False) -> KnownDistricts:
+        """What lists say that came under their keys; see `ask`. `heads`: they may come without their districts."""
         good, refused = list[DistrictList](), list[str]()
         for key, told in replies:
             try:
-                self._check(key, told)
+                self._check(key, told, heads=heads)
                 good.append(told)
             except _RefusedListError as error:
                 counted("catalog", f"list {error.reason}")
@@ -106,11 +119,11 @@ class ListCheck:
             " is withheld, or its tile server is away, or its store has another name now"
         )
 
-    def _check(self, key: str, told: DistrictList) -> None:
+    def _check(self, key: str, told: DistrictList, *, heads: bool) -> None:
         layer, region = parse_list_key(key)
         if (layer, region) != (told.head.layer, told.head.region) or layer != self._layer:
             raise _RefusedListError("wrong", f"is that of layer {told.head.layer}, region {told.head.region}")
-        if told.numbers is None:
+        if told.numbers is None and not heads:
             raise _RefusedListError("wrong", f"came without its {told.head.count} districts")
         check_answered(self._publishers, told)
         signed, newest = told.signature, self._seen.newest(self._name(told))

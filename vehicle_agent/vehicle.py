@@ -162,6 +162,7 @@ class AgentVehicle:
             tiles_held_back=held_back.tiles,
             tiles_doubtful=held_back.doubtful,
             doubts=tiles_by_reason(held_back.reasons),
+            map_stale_h=0 if self.link.map_age is None else self.link.map_age.stale_h,
         )
 
     def result(self) -> dict[str, Any]:
@@ -189,6 +190,7 @@ class AgentVehicle:
         return {
             "tiles_downloaded": fetched["blob"],
             "tiles": dict(fetched),
+            "map_stale_h": 0 if self.link.map_age is None else self.link.map_age.stale_h,
             "versions_checked": {} if check is None else dict(check.counts),
             "feature_tiles": {} if self.bus.features is None else dict(self.bus.features.counts),
             "updates_received": updates["received"],

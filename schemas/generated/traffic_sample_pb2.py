@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from . import traffic_line_pb2 as gnd_dot_v1_dot_traffic__line__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bgnd/v1/traffic_sample.proto\x12\x06gnd.v1\x1a\x19gnd/v1/traffic_line.proto\"\xd2\x02\n\rTrafficSample\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0f\n\x07vehicle\x18\x02 \x01(\t\x12\x0c\n\x04t_ns\x18\x03 \x01(\x10\x12\x12\n\nodometer_m\x18\x04 \x01(\x01\x12\"\n\x05lines\x18\x05 \x03(\x0b\x32\x13.gnd.v1.TrafficLine\x12\x15\n\rwire_up_bytes\x18\x06 \x01(\x04\x12\x17\n\x0fwire_down_bytes\x18\x07 \x01(\x04\x12\x0f\n\x07lat_rad\x18\x08 \x01(\x01\x12\x0f\n\x07lon_rad\x18\t \x01(\x01\x12\x0e\n\x06health\x18\n \x01(\t\x12\r\n\x05tiles\x18\x0b \x01(\r\x12\x0f\n\x07reports\x18\x0c \x01(\r\x12\x18\n\x10scans_taken_back\x18\r \x01(\r\x12\x17\n\x0ftiles_held_back\x18\x0e \x01(\r\x12\x16\n\x0etiles_doubtful\x18\x0f \x01(\r\x12\x0e\n\x06\x64oubts\x18\x10 \x03(\rb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bgnd/v1/traffic_sample.proto\x12\x06gnd.v1\x1a\x19gnd/v1/traffic_line.proto\"\xe7\x02\n\rTrafficSample\x12\r\n\x05major\x18\x01 \x01(\r\x12\x0f\n\x07vehicle\x18\x02 \x01(\t\x12\x0c\n\x04t_ns\x18\x03 \x01(\x10\x12\x12\n\nodometer_m\x18\x04 \x01(\x01\x12\"\n\x05lines\x18\x05 \x03(\x0b\x32\x13.gnd.v1.TrafficLine\x12\x15\n\rwire_up_bytes\x18\x06 \x01(\x04\x12\x17\n\x0fwire_down_bytes\x18\x07 \x01(\x04\x12\x0f\n\x07lat_rad\x18\x08 \x01(\x01\x12\x0f\n\x07lon_rad\x18\t \x01(\x01\x12\x0e\n\x06health\x18\n \x01(\t\x12\r\n\x05tiles\x18\x0b \x01(\r\x12\x0f\n\x07reports\x18\x0c \x01(\r\x12\x18\n\x10scans_taken_back\x18\r \x01(\r\x12\x17\n\x0ftiles_held_back\x18\x0e \x01(\r\x12\x16\n\x0etiles_doubtful\x18\x0f \x01(\r\x12\x0e\n\x06\x64oubts\x18\x10 \x03(\r\x12\x13\n\x0bmap_stale_h\x18\x11 \x01(\rb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,5 +33,5 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.traff
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_TRAFFICSAMPLE']._serialized_start=67
-  _globals['_TRAFFICSAMPLE']._serialized_end=405
+  _globals['_TRAFFICSAMPLE']._serialized_end=426
 # @@protoc_insertion_point(module_scope)

@@ -41,6 +41,7 @@ class TrafficSample(_message.Message):
     TILES_HELD_BACK_FIELD_NUMBER: _builtins.int
     TILES_DOUBTFUL_FIELD_NUMBER: _builtins.int
     DOUBTS_FIELD_NUMBER: _builtins.int
+    MAP_STALE_H_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     vehicle: _builtins.str
@@ -69,6 +70,10 @@ class TrafficSample(_message.Message):
     """Tiles of which nothing was told because an error of the poses explains what seemed to have changed."""
     tiles_doubtful: _builtins.int
     """Tiles reported with a doubt, those held back included."""
+    map_stale_h: _builtins.int
+    """How long ago the publishers of the vehicle's map have confirmed it for the last time, where that is too long: newer
+    versions may be withheld, or the cloud is away. 0: not long ago, or nobody looks at signatures. [h]
+    """
     @_builtins.property
     def lines(self) -> _containers.RepeatedCompositeFieldContainer[_traffic_line_pb2.TrafficLine]:
         """One line a kind and direction; no pair twice."""
@@ -96,10 +101,11 @@ class TrafficSample(_message.Message):
         tiles_held_back: _builtins.int = ...,
         tiles_doubtful: _builtins.int = ...,
         doubts: _abc.Iterable[_builtins.int] | None = ...,
+        map_stale_h: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["doubts", b"doubts", "health", b"health", "lat_rad", b"lat_rad", "lines", b"lines", "lon_rad", b"lon_rad", "major", b"major", "odometer_m", b"odometer_m", "reports", b"reports", "scans_taken_back", b"scans_taken_back", "t_ns", b"t_ns", "tiles", b"tiles", "tiles_doubtful", b"tiles_doubtful", "tiles_held_back", b"tiles_held_back", "vehicle", b"vehicle", "wire_down_bytes", b"wire_down_bytes", "wire_up_bytes", b"wire_up_bytes"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["doubts", b"doubts", "health", b"health", "lat_rad", b"lat_rad", "lines", b"lines", "lon_rad", b"lon_rad", "major", b"major", "map_stale_h", b"map_stale_h", "odometer_m", b"odometer_m", "reports", b"reports", "scans_taken_back", b"scans_taken_back", "t_ns", b"t_ns", "tiles", b"tiles", "tiles_doubtful", b"tiles_doubtful", "tiles_held_back", b"tiles_held_back", "vehicle", b"vehicle", "wire_down_bytes", b"wire_down_bytes", "wire_up_bytes", b"wire_up_bytes"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -15,8 +15,10 @@ from gnd.deploy.ports import claim_port
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.serving import Request
+from gnd.schemas.district_list import HEAD_ONLY
+from gnd.schemas.keys import list_key, list_keys
 
-What = Literal["question", "report", "word", "telemetry"]
+What = Literal["question", "report", "word", "telemetry", "head"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +26,8 @@ class KilometreMessage:
     """A message of the vehicle, or a word to it, and what comes back.
 
     Attributes:
-        what: a question about the map; a report; a word of the shard to the vehicle; a sample of telemetry.
+        what: a question about the map; a report; a word of the shard to the vehicle; a sample of telemetry; a question
+            after the head of the list of districts.
         up: payload bytes from the vehicle.
         down: payload bytes to it, of an answer that says to what it is one.
         named: so many of these say to what it is one: they are left out where the seal shows that.
@@ -46,6 +49,8 @@ _REPORTS: Final = tuple(KilometreMessage("report", up, _ACK_BYTES + _TOLD_BYTES,
 _TELEMETRY: Final = (KilometreMessage("telemetry", 62, 0), KilometreMessage("telemetry", 159, 0))
 WORD: Final = KilometreMessage("word", 0, 28)
 """What a shard tells where a vehicle is not patient, or something is wanted of it: none in this kilometre."""
+HEAD: Final = KilometreMessage("head", 1, 135)
+"""By which a vehicle with an identity hears every six hours that its map is not frozen: none in this kilometre."""
 _QUESTIONS: Final = tuple(KilometreMessage("question", up, down) for up, down in ((153, 77), (155, 52)))
 """At the start, and after 120 s; in a faster drive, instead of the second one, where the next district comes near."""
 KILOMETRE: Final = (*_QUESTIONS, *_REPORTS, *_TELEMETRY)
@@ -82,6 +87,8 @@ class Wired:
             self.vehicle.request(_REPORTED, asked, kind="change", timeout_s=20)
         elif one.what == "word":
             self.shard.publish(_WORD, bytes(one.down), kind="ack")
+        elif one.what == "head":
+            self.vehicle.request_many(list_keys("ndt"), HEAD_ONLY, kind="catalog", timeout_s=20)
         else:
             self.vehicle.publish("gnd/v1/traffic/vehicle-00", bytes(one.up), kind="telemetry")
         time.sleep(PAUSE_S)
@@ -111,6 +118,7 @@ def wired(endpoint: str, identities: Path | None) -> Iterator[Wired]:
     )
     with open_bus(store) as tiles, open_bus(shard) as merger, open_bus(vehicle) as car:
         tiles.serve("gnd/v1/tiles/**", _as_much_as_asked, complete=True)
+        tiles.serve("gnd/v1/catalog/**", lambda _: [(list_key("ndt", "main"), bytes(HEAD.down))], complete=True)
         merger.serve("gnd/v1/change/**", _as_much_as_asked, complete=True, kind="change")
         car.subscribe(_WORD, lambda _key, _payload: None, kind="ack")
         yield Wired(car, merger)

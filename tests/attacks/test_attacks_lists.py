@@ -6,7 +6,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,9 +25,11 @@ from gnd.schemas.district_list import DistrictList, DistrictsHead, DistrictsSign
 from gnd.schemas.errors import NotSigned, SchemaError
 from gnd.schemas.tiles import Catalog
 from gnd.tile_client.archive_check import SeenStates
+from gnd.tile_client.checking import SeenInMemory, VersionCheck
 from gnd.tile_client.fetching import TileServerClient
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.link.map_age import MapAge, MapAgeTimes
 
 OTHER = TileId(FIRST.morton + TILES_OF_DISTRICT)
 HOME, AWAY = FIRST.district, OTHER.district
@@ -278,13 +281,69 @@ def test_attack_list_of_a_revoked_shard(scene: VersionScene) -> None:
     is_refused(scene, signed_by(scene, gone, NUMBERS[:1], 1800.0), "was revoked")
 
 
+# ---- a map that is frozen
+
+
+def until(what: Callable[[], bool], why: str) -> None:
+    end_s = time.monotonic() + 20.0
+    while not what():
+        assert time.monotonic() < end_s, why
+        time.sleep(0.02)
+
+
+def test_attack_map_frozen_for_a_vehicle(scene: VersionScene, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Everything that a vehicle hears is two days old, or nobody answers it: it drives on, and says in its log and its
+    telemetry for how long nobody has confirmed its map, also after a new start. What is younger than it has seen ends
+    that; what is older, or signed by who may not, does not."""
+    past = scene.authority.part("shard", "frozen", begins=NOW - 3 * DAY, ends=NOW + DAY)
+    old, told = signed_by(scene, past, NUMBERS, 2 * 86_400.0, number=3), true_list(scene)
+    check = VersionCheck.on_the_bus(scene.vehicle, LAYER, SeenInMemory())
+    assert check is not None
+    path, times = tmp_path / "seen.json", MapAgeTimes(again_s=0.05, look_s=0.05)
+
+    def vehicle() -> MapAge:
+        return MapAge(scene.vehicle, LAYER, check.publishers, SeenStates(path), times)
+
+    scene.server.alter_lists = lambda _true: [old]
+    with caplog.at_level("WARNING"), closing(vehicle()) as age:
+        assert age.stale_h == 0, "it has just begun to look"
+        until(lambda: age.stale_h == 48, "an old list is not told of")
+        until(lambda: "the map is stale: its publishers have confirmed it 48.0 h ago" in caplog.text, "no word")
+        scene.server.alter_lists = lambda _true: [signed_by(scene, scene.parts["tiles"], NUMBERS)]
+        until(lambda: "signs no versions" in caplog.text, "it is not asked again")
+        assert age.stale_h == 48
+    scene.server.alter_lists = lambda _true: []
+    with closing(vehicle()) as age:
+        assert age.stale_h == 48, "known from before the start"
+        scene.server.alter_lists = None
+        until(lambda: age.stale_h == 0, "a fresh list does not end it")
+        asked = len(scene.server.asked)
+        time.sleep(0.3)
+        assert len(scene.server.asked) == asked, "it is not asked again while that is young"
+    with closing(vehicle()) as age:
+        time.sleep(0.3)
+        assert (len(scene.server.asked), age.stale_h) == (asked, 0), "nor after a new start"
+        assert abs(time.time() - told.signature.signed_s - age.age_s) <= 1.0
+
+
+def test_a_vehicle_asks_for_a_head_alone(scene: VersionScene, tmp_path: Path) -> None:
+    """And no more often than every six hours."""
+    check = VersionCheck.on_the_bus(scene.vehicle, LAYER, SeenInMemory())
+    assert check is not None
+    before = len(scene.server.asked)
+    with closing(MapAge(scene.vehicle, LAYER, check.publishers, SeenStates(tmp_path / "seen.json"))):
+        until(lambda: len(scene.server.asked) > before, "it does not ask")
+    assert scene.server.asked[before:] == [b"\x01"]
+
+
 # ---- after a restart
 
 PROGRAM = """
 import sys, time, gnd
 with gnd.connect(sys.argv[1], timeout_s=20.0) as client:
     try:
-        print("took", *(f"{one.version}" for one in client.catalog()), "refused", *client.refused().values(), flush=True)
+        found = [one.version for one in client.catalog()]
+        print("took", *found, "refused", *client.refused().values(), flush=True)
     except gnd.GndError as error:
         print("refused", error, flush=True)
     time.sleep(60.0)

@@ -20,7 +20,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas import keys
-from gnd.schemas.district_list import DistrictList
+from gnd.schemas.district_list import HEAD_ONLY, DistrictList
 from gnd.schemas.tiles import Catalog
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.version_signature import VersionSignature, VersionStatement
@@ -66,6 +66,8 @@ class BrokenServer:
     """What it says of other districts; None: nothing."""
     strange: dict[District, Catalog] = field(default_factory=dict)
     """Of districts that its store has not."""
+    asked: list[bytes] = field(default_factory=list)
+    """Payloads of questions after lists of districts."""
     chains: dict[str, bytes] = field(default_factory=dict)
     """What it shows for ids of certificates that the store has not."""
 
@@ -92,7 +94,8 @@ class BrokenServer:
 
     def catalog(self, request: Request) -> list[tuple[str, bytes]]:
         if keys.layer_of_lists(request.key):
-            return self.lists()
+            self.asked.append(request.payload)
+            return self.lists(request.payload)
         true = self.store.catalog(LAYER, FIRST.district)
         said = true if self.alter_catalog is None else self.alter_catalog(true)
         others = sorted({head.tile.district for head in self.store.heads(LAYER)} - {FIRST.district})
@@ -105,11 +108,12 @@ class BrokenServer:
         asked = request.key.removesuffix("**")
         return [(key, one.encode()) for key, one in named if one is not None and f"{key}/".startswith(asked)]
 
-    def lists(self) -> list[tuple[str, bytes]]:
+    def lists(self, payload: bytes) -> list[tuple[str, bytes]]:
         true = self.store.district_list(LAYER)
         assert true is not None
         said = [true] if self.alter_lists is None else self.alter_lists(true)
-        return [(keys.list_key(LAYER, one.head.region), one.encode()) for one in said]
+        told = [one.without_districts if payload == HEAD_ONLY else one for one in said]
+        return [(keys.list_key(LAYER, one.head.region), one.encode()) for one in told]
 
     def certificate(self, request: Request) -> bytes:
         name = request.key.rpartition("/")[2]

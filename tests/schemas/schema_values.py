@@ -334,6 +334,7 @@ GOLDEN: dict[str, Any] = {
     ),
     "TileUpdate-made": update(day=9750, made_s=1_764_000_000),
     "TrafficSample-two_lines": sample(),
+    "TrafficSample-stale_map": sample(map_stale_h=26),
     "TrafficSample-doubts": sample(scans_taken_back=31, tiles_held_back=2, tiles_doubtful=4, doubts=(2, 0, 1, 0, 1)),
     "TrafficSample-start": sample(
         lines=(), odometer_m=0.0, wire_up_bytes=0, wire_down_bytes=0, health="starting", tiles=0, reports=0

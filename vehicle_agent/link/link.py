@@ -13,11 +13,12 @@ from gnd.gnd_map.tile import Tile
 from gnd.schemas.keys import alive_key
 from gnd.schemas.ticket import ticket_of
 from gnd.tile_client.archive import Archive
-from gnd.tile_client.archive_check import SEEN_FILE
+from gnd.tile_client.archive_check import CATALOGS_SEEN_FILE, SEEN_FILE, SeenStates
 from gnd.tile_client.http_reader import HURRIED
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.link.download import TileFetcher
+from gnd.vehicle_agent.link.map_age import MapAge
 from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.link.sending import SenderThread
 
@@ -34,6 +35,8 @@ class Link:
     outbox: Outbox
     fetcher: TileFetcher[Tile]
     sender: SenderThread
+    map_age: MapAge | None = None
+    """None: without an identity nobody looks at signatures."""
     archive: Archive | None = None
     """Where tiles come from before the bus is asked; None: it is asked for all."""
 
@@ -73,12 +76,18 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
     seen = config.work_dir / SEEN_FILE
     fetcher = TileFetcher(bus, cache, config.download, ticket_of(config.vehicle), archive, seen)
     sender = SenderThread(bus, outbox, config.vehicle)
+    map_age = None
+    if fetcher.check is not None:
+        lists_seen = SeenStates(config.work_dir / CATALOGS_SEEN_FILE)
+        map_age = MapAge(bus, config.layer, fetcher.check.publishers, lists_seen)
     try:
-        yield Link(bus, ledger, cache, outbox, fetcher, sender, archive)
+        yield Link(bus, ledger, cache, outbox, fetcher, sender, map_age, archive)
     finally:
         if archive is not None:
             archive.close()
         bus.close()  # ends the requests under way, so that the threads can end
+        if map_age is not None:
+            map_age.close()
         sender.close()
         fetcher.close()
         cache.close()

@@ -98,4 +98,4 @@ class Telemetry:
 
 def _well_being(sample: TrafficSample) -> tuple[object, ...]:
     """Scans that are taken back come in rows: they wait for the next sample."""
-    return sample.health, sample.tiles_held_back, sample.tiles_doubtful
+    return sample.health, sample.tiles_held_back, sample.tiles_doubtful, sample.map_stale_h > 0
