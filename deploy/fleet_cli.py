@@ -210,6 +210,7 @@ def run(
         from gnd.deploy.live import progress_bars
         from gnd.deploy.processes import start_fork_server
         from gnd.tile_store.catalogs import sign_unsigned_catalogs
+        from gnd.tile_store.district_lists import sign_list
         from gnd.tile_store.signatures import sign_unsigned
         from gnd.tile_store.signing import Signing
         from gnd.tile_store.sqlite_store import SqliteStore
@@ -239,6 +240,8 @@ def run(
         with SqliteStore(folder.store, signing=Signing(identities / "fleet")) as store:
             sign_unsigned(store)  # the base map: without that no vehicle would take it
             sign_unsigned_catalogs(store)
+            for layer in store.layers():
+                sign_list(store, layer)
     prepare_s = time.monotonic() - started_s
     with orderly(), place() as site:
         outcome = run_fleet(config, folder, prepared, console, threading.Event(), site, page=page)
