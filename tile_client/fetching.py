@@ -21,7 +21,7 @@ from gnd.tile_client.archive_check import SeenStates
 from gnd.tile_client.catalog_check import NOTICED_AFTER_S, CatalogCheck, set_back
 from gnd.tile_client.checking import SeenInMemory, VersionCheck
 from gnd.tile_client.exchange import Exchange, ExchangeOutcome, TilesInMemory
-from gnd.tile_client.list_check import KnownDistricts, ListCheck
+from gnd.tile_client.list_check import ListCheck, ListedDistricts
 
 BATCH_BYTES: Final = 1_000_000
 """Bodies of one answer: large enough that a district comes in a few, small enough for a slow link."""
@@ -120,7 +120,7 @@ class TileServerClient:
             self.stale[district] = age_s
         return catalog.entries
 
-    def _compare(self, listed: KnownDistricts, region: Region, found: dict[str, tuple[CatalogEntry, ...]]) -> None:
+    def _compare(self, listed: ListedDistricts, region: Region, found: dict[str, tuple[CatalogEntry, ...]]) -> None:
         """Refuse districts that no list names, and note those that a list names and that did not come."""
         assert self._lists is not None
         came = {parse_catalog_key(key)[1]: key for key, entries in found.items() if entries}

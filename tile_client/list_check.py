@@ -27,7 +27,7 @@ _SELDOM: Final = Seldom(logging.getLogger(__name__))
 
 
 @dataclass(frozen=True, slots=True)
-class KnownDistricts:
+class ListedDistricts:
     """The districts of a layer.
 
     Attributes:
@@ -60,9 +60,9 @@ class ListCheck:
 
     def __init__(self, publishers: Publishers, layer: str, seen: SeenStates, oldest_s: float | None = None) -> None:
         self._publishers, self._layer, self._seen, self._oldest_s = publishers, layer, seen, oldest_s
-        self._lock, self._known, self._until_s = threading.Lock(), KnownDistricts(), float("-inf")
+        self._lock, self._known, self._until_s = threading.Lock(), ListedDistricts(), float("-inf")
 
-    def ask(self, bus: Bus, timeout_s: float, *, again: bool = False) -> KnownDistricts:
+    def ask(self, bus: Bus, timeout_s: float, *, again: bool = False) -> ListedDistricts:
         """The districts of the layer; those of a moment ago, unless they are asked for again.
 
         Raises:
@@ -92,7 +92,7 @@ class ListCheck:
             raise NotSigned(f"list of districts of layer {self._layer}: nobody has signed one")
         return signed_s
 
-    def check(self, replies: list[tuple[str, DistrictList]], *, heads: bool = False) -> KnownDistricts:
+    def check(self, replies: list[tuple[str, DistrictList]], *, heads: bool = False) -> ListedDistricts:
         """What lists say that came under their keys; see `ask`. `heads`: they may come without their districts."""
         good, refused = list[DistrictList](), list[str]()
         for key, told in replies:
@@ -110,7 +110,7 @@ class ListCheck:
         if not good and (refused or missing):
             raise NotSigned(refused[0] if refused else self._withheld(missing))
         numbers = frozenset(number for one in good for number in one.numbers or ())
-        return KnownDistricts(numbers, min((one.signature.signed_s for one in good), default=0))
+        return ListedDistricts(numbers, min((one.signature.signed_s for one in good), default=0))
 
     def _withheld(self, missing: set[str]) -> str:
         regions = ", ".join(sorted(name.partition("@")[2] for name in missing)[:3])
