@@ -23,7 +23,7 @@ from gnd.cloud_merger.release.keeper import KEEP_EVERY_S, ReleaseKeeper
 from gnd.cloud_merger.states import States
 from gnd.cloud_merger.stored import Bases
 from gnd.cloud_merger.survey.mapper import RoadMapper
-from gnd.cloud_merger.warm import warm_up
+from gnd.cloud_merger.warming import warmed_up
 from gnd.cloud_merger.work import Worker, in_turn
 from gnd.cloud_merger.worker_process import Address, Tell, worker_process
 from gnd.fleet_bus.bus import open_bus
@@ -118,7 +118,8 @@ def run_worker(
         IdentityError: the identity of this process is no shard's.
     """
     signing = Signing.of_environment()
-    warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
+    # or the first tile and the first report would wait for the kernels, and their leases with them
+    warmed_up(config.shard_id, metrics_at)
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms, patient=True)
     with (
         open_store(config.store_path, config.store, create=False, signing=signing) as store,
