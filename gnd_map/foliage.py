@@ -6,6 +6,7 @@ change follows the season where a slim trunk stands unchanged near by, where wha
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I32, I64, are_in
 from gnd.gnd_map.beside import count_beside
+from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.over_ground import flat_places_m, ground_m, places_m
@@ -91,9 +93,23 @@ class _Region:
         index = np.stack(grid.unravel(gaussians.voxel_id), axis=1)
         return cls(index, place, height, height - 1.7 * upright, loose, across, upright)
 
+    def take(self, rows: Mask) -> "_Region":
+        """Some of them."""
+        columns = (self.index, self.place_m, self.height_m, self.low_m, self.is_loose, self.across_m, self.upright_m)
+        return _Region(*(one[rows] for one in columns))
+
     @property
     def hangs(self) -> Mask:
         return np.asarray(self.low_m > HANG_M)
+
+
+_MAPPED: Final[ByObject[tuple[F64, _Region]]] = ByObject(256)
+"""Of a tile's map: what is flat, and all of it; the merges of a window ask about the same one."""
+
+
+def _mapped(grid: VoxelGrid, before: Gaussians) -> tuple[F64, _Region]:
+    flat = flat_places_m(grid, before)
+    return flat, _Region.of(grid, before, flat)
 
 
 def follows_season(grid: VoxelGrid, before: Gaussians, removed: I32, put: Gaussians) -> I32:
@@ -108,21 +124,20 @@ def follows_season(grid: VoxelGrid, before: Gaussians, removed: I32, put: Gaussi
     Returns:
         Sorted ids, some of `removed` and `put`. Where the map has no ground or no trunk: none.
     """
-    flat = flat_places_m(grid, before)
     changed_ids = np.concatenate([removed, put.voxel_id])
-    if not len(flat) or not len(changed_ids):
+    if not len(changed_ids):
         return np.zeros(0, np.int32)
-    went, came = (
-        _Region.of(grid, before.take(np.flatnonzero(are_in(before.voxel_id, removed))), flat),
-        _Region.of(grid, put, flat),
-    )
+    flat, mapped = _MAPPED.of(before, partial(_mapped, grid, before), grid.tile)
+    if not len(flat):
+        return np.zeros(0, np.int32)
+    went, came = mapped.take(are_in(before.voxel_id, removed)), _Region.of(grid, put, flat)
     index = np.concatenate([went.index, came.index])
     place = np.concatenate([went.place_m, came.place_m])
     loose = np.concatenate([went.is_loose, came.is_loose])
     maybe = loose & np.concatenate([went.hangs, came.hangs])
     if not maybe.any():
         return np.zeros(0, np.int32)
-    kept = _Region.of(grid, before.take(np.flatnonzero(~are_in(before.voxel_id, np.sort(changed_ids)))), flat)
+    kept = mapped.take(~are_in(before.voxel_id, np.sort(changed_ids)))
     trunk_m = _trunks_m(kept, before, grid, place, np.concatenate([went.height_m, came.height_m]), loose)
     maybe &= _near(place, trunk_m)
     is_twig = kept.is_loose & kept.hangs & ~_is_slim(kept) & _near(kept.place_m, trunk_m)

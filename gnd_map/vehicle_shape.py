@@ -6,6 +6,7 @@ and not longer than a row of cars of its height. Only Gaussians are used, so a v
 nothing is sent for it.
 """
 
+from functools import partial
 from typing import Final, Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.beside import count_beside, groups_of
+from gnd.gnd_map.by_content import ByContent
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.over_ground import FLAT_SIGMA_M, flat_places_m, ground_m, places_m
@@ -125,17 +127,26 @@ def has_vehicle_shape(grid: VoxelGrid, before: Gaussians, new: Gaussians) -> Mas
     cov = new.cov_m2.astype(np.float64)
     is_paving = (new.cov_m2[:, 5] < FLAT_SIGMA_M**2) & (top < PAVING_M)
 
-    def shape_of(part: I64) -> Shape:
-        return _shape(index[part], low[part], top[part], place[part, :2], cov[part])
-
     for mine in groups_of(index, np.flatnonzero(~is_paving)):
-        if shape_of(mine) != "none":
-            found[mine] = True
-            continue
-        is_low = _column_tops(index[mine], top[mine]) <= TOP_M[1]
-        for part in groups_of(index, mine[is_low]):  # a car beside a higher thing
-            is_free = np.sum(count_beside(index[part], index[mine[~is_low]]) > 0) <= MOST_CONTACT * len(part)
-            found[part] = is_free and shape_of(part) == "vehicle"
+        group = index[mine], low[mine], top[mine], place[mine, :2], cov[mine]
+        found[mine] = _JUDGED.of(group, partial(_judged, *group))
+    return found
+
+
+_JUDGED: Final[ByContent[Mask]] = ByContent(8192)
+"""Most groups of a tile are the same in its next merge."""
+
+
+def _judged(index: I64, low: F64, top: F64, at: F64, cov: F64) -> Mask:
+    """(K,) which voxels of a group have the shape of a vehicle; arguments as of `_shape`."""
+    found = np.zeros(len(index), np.bool_)
+    if _shape(index, low, top, at, cov) != "none":
+        found[:] = True
+        return found
+    is_low = _column_tops(index, top) <= TOP_M[1]
+    for part in groups_of(index, np.flatnonzero(is_low)):  # a car beside a higher thing
+        is_free = np.sum(count_beside(index[part], index[~is_low]) > 0) <= MOST_CONTACT * len(part)
+        found[part] = is_free and _shape(index[part], low[part], top[part], at[part], cov[part]) == "vehicle"
     return found
 
 

@@ -198,7 +198,7 @@ def test_a_memory_of_before_has_nothing_parked():
 def test_every_bound_of_a_vehicles_shape_travels_with_the_map():
     """A release with another bound knows that it computes another map."""
     bounds = [
-        value for name, value in vars(vehicle_shape).items() if re.fullmatch(r"[A-Z_]+", name) and name != "BOUNDS"
+        value for name, value in vars(vehicle_shape).items() if re.fullmatch(r"[A-Z][A-Z_]*", name) and name != "BOUNDS"
     ]
     numbers = [number for bound in bounds for number in (bound if isinstance(bound, tuple) else (bound,))]
     assert sorted(numbers) == sorted(vehicle_shape.BOUNDS.values())
