@@ -30,7 +30,7 @@ class ByContent(Generic[T]):
         digest = blake2b(digest_size=16)
         for one in arrays:
             digest.update(repr(one.shape).encode())
-            digest.update(np.ascontiguousarray(one))
+            digest.update(np.ascontiguousarray(one).tobytes())
         place = digest.digest()
         with self._lock:
             if place in self._held:

@@ -95,8 +95,8 @@ class _Region:
 
     def take(self, rows: Mask) -> "_Region":
         """Some of them."""
-        columns = (self.index, self.place_m, self.height_m, self.low_m, self.is_loose, self.across_m, self.upright_m)
-        return _Region(*(one[rows] for one in columns))
+        index, place, height, low = self.index[rows], self.place_m[rows], self.height_m[rows], self.low_m[rows]
+        return _Region(index, place, height, low, self.is_loose[rows], self.across_m[rows], self.upright_m[rows])
 
     @property
     def hangs(self) -> Mask:
