@@ -59,6 +59,8 @@ def test_nothing_changed_and_no_ground():
 
 
 def test_every_constant_travels_with_the_map():
-    values = [value for name, value in vars(foliage).items() if re.fullmatch(r"[A-Z][A-Z_]*", name) and name != "BOUNDS"]
+    values = [
+        value for name, value in vars(foliage).items() if re.fullmatch(r"[A-Z][A-Z_]*", name) and name != "BOUNDS"
+    ]
     numbers = [one for value in values for one in (value if isinstance(value, tuple) else (value,))]
     assert sorted(numbers) == sorted(foliage.BOUNDS.values())
