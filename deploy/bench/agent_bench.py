@@ -29,6 +29,7 @@ from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.world import read_world
 from gnd.gnd_map.settings import plain_settings
 from gnd.schemas.drive_mcap import read_header
+from gnd.tile_store.sqlite_store import SqliteStore
 
 SENSORS: Final = ("vlp16", "hdl32e", "hdl64e")
 WARM_UP_SCANS: Final = 20
@@ -162,7 +163,9 @@ def _simulated(config: FleetConfig, folder: RunFolder, progress: Progress) -> di
 
 def _recorded(drive: Path, base_map: Path | None, folder: RunFolder) -> dict[str, Path]:
     read_header(drive).check_placed()  # a broken file is refused before any process starts
-    if base_map is not None:
+    if base_map is None:
+        SqliteStore(folder.store).close()  # an empty map: tile server and shard open no store that is not there
+    else:
         copy_store(base_map, folder.store)
     return {drive.stem: drive}
 
