@@ -105,9 +105,9 @@ def trips(tmp_path_factory: pytest.TempPathFactory) -> Trips:
     folder = tmp_path_factory.mktemp("privacy")
     world = street(11, StreetOptions(length_m=260.0))
     simulate_drive(
-        world, DriveConfig("mapper", "VLP-16", state="before", errors=PERFECT, cruise_mps=14.0), folder / "map.mcap"
+        world, DriveConfig("mapper", "VLP-16", state="before", errors=PERFECT, cruise_mps=20.0), folder / "map.mcap"
     )
-    simulate_drive(world, DriveConfig("trip", "VLP-16", seed=4, cruise_mps=12.0), folder / "trip.mcap")
+    simulate_drive(world, DriveConfig("trip", "VLP-16", seed=4, cruise_mps=20.0), folder / "trip.mcap")
     authority = Authority.create(folder / "authority", "tests")
     for member, name in (("router.main", "router"), ("tiles.store", "store"), ("shard.s", "s"), ("operator.o", "o")):
         authority.issue(MemberName.parse(member), folder / name)
