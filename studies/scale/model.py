@@ -6,6 +6,7 @@ threads that expand, a tile that becomes ready some time after its first waiting
 four settled together. The database uses the same cores, or has some of its own, for which its clients wait.
 """
 
+import heapq
 import random
 from collections import Counter, deque
 from collections.abc import Generator, Iterable
@@ -150,6 +151,33 @@ class SimulatedRun:
     is_drained: bool = False
 
 
+class _Waiting:
+    """Tiles that wait and that nobody has leased, by the time at which they are ready.
+
+    Every poll of every shard asks it. What a tile's later times have overtaken is thrown away when it comes to the top.
+    """
+
+    def __init__(self, dirty: dict[int, _Dirty]) -> None:
+        self._dirty = dirty
+        self._heap: list[tuple[float, int]] = []
+
+    def note(self, tile: int, one: _Dirty) -> None:
+        """A tile's time is new, or its lease is over."""
+        heapq.heappush(self._heap, (one.ready_s, tile))
+
+    def first(self, most: int) -> list[int]:
+        """The tiles that are ready first, in the order of their times and numbers."""
+        found: dict[int, tuple[float, int]] = {}
+        while self._heap and len(found) < most:
+            ready_s, tile = entry = heapq.heappop(self._heap)
+            one = self._dirty.get(tile)
+            if one is not None and not one.is_leased and one.ready_s == ready_s:
+                found[tile] = entry
+        for entry in found.values():
+            heapq.heappush(self._heap, entry)
+        return list(found)
+
+
 class CloudModel:
     """One host with its shards.
 
@@ -170,6 +198,8 @@ class CloudModel:
         self._uploads: list[deque[tuple[SimulatedReport, float, bool]]] = [deque() for _ in range(rules.shards)]
         self._woken = [self._env.event() for _ in range(rules.shards)]
         self._dirty: dict[int, _Dirty] = {}
+        self._waiting = _Waiting(self._dirty)
+        self._own_waiting = [_Waiting(self._dirty) for _ in range(rules.shards)]
         self._window: Counter[int] = Counter()  # reports of each tile's open window
         self._open = 0  # reports that are not through
         self.run_ = SimulatedRun()
@@ -264,6 +294,12 @@ class CloudModel:
         dirty.waiting.append(came_s)
         is_full = len(dirty.waiting) >= merge_after
         dirty.ready_s = min(dirty.ready_s, self._env.now + (0.0 if is_full else delay_s))
+        self._note(tile, dirty)
+
+    def _note(self, tile: int, dirty: _Dirty) -> None:
+        if not dirty.is_leased:
+            self._waiting.note(tile, dirty)
+            self._own_waiting[dirty.shard].note(tile, dirty)
 
     def _answer(self, one: SimulatedReport) -> Step:
         yield self._env.timeout(self._costs.answer_s)
@@ -297,18 +333,21 @@ class CloudModel:
     def _claimed(self, shard: int) -> list[int]:
         """Ready tiles, those first that have waited longest: the shard's own, and those of others that lag."""
         now_s, turns = self._env.now, list[tuple[float, int]]()
-        for tile, one in self._dirty.items():
-            waited_s = now_s - one.ready_s
-            is_own = one.shard == shard
-            if not one.is_leased and waited_s >= (0.0 if is_own else HELP_AFTER_S):
-                turns.append((HELP_AFTER_S + HELP_FACTOR * waited_s if is_own else waited_s, tile))
+        for tile in self._own_waiting[shard].first(TILES_AT_ONCE):
+            if (waited_s := now_s - self._dirty[tile].ready_s) >= 0.0:
+                turns.append((HELP_AFTER_S + HELP_FACTOR * waited_s, tile))
+        # the shard's own among the first of all have more weight than what comes after them
+        for tile in self._waiting.first(TILES_AT_ONCE):
+            waited_s = now_s - self._dirty[tile].ready_s
+            if self._dirty[tile].shard != shard and waited_s >= HELP_AFTER_S:
+                turns.append((waited_s, tile))
         claims = [tile for _, tile in sorted(turns, key=lambda turn: (-turn[0], turn[1]))[:TILES_AT_ONCE]]
         for tile in claims:
             self._dirty[tile].is_leased = True
         return claims
 
     def _idle_s(self) -> float:
-        soonest_s = min((one.ready_s for one in self._dirty.values() if not one.is_leased), default=float("inf"))
+        soonest_s = min((self._dirty[tile].ready_s for tile in self._waiting.first(1)), default=float("inf"))
         wait_s = soonest_s - self._env.now
         return min(OTHERS_IDLE_S if wait_s <= 0.0 else max(wait_s, LEAST_IDLE_S), self._rules.poll_s)
 
@@ -325,3 +364,4 @@ class CloudModel:
         dirty.is_leased = False
         is_full = len(dirty.waiting) >= self._rules.merge_after
         dirty.ready_s = self._env.now + (0.0 if is_full else self._rules.merge_delay_s)
+        self._note(tile, dirty)
