@@ -36,7 +36,9 @@ def test_a_recording_is_driven_and_every_stage_is_told(tmp_path: Path) -> None:
     assert found["ratio"] == {}
     logs = {file.stem: file.read_text(encoding="utf-8") for file in (tmp_path / "run" / "logs").glob("*.log")}
     assert {"router", "store", "merger-0", "a"} <= set(logs)
-    assert not [line for log in logs.values() for line in log.splitlines() if "Traceback" in line or "failed after" in line]
+    assert not [
+        line for log in logs.values() for line in log.splitlines() if "Traceback" in line or "failed after" in line
+    ]
 
 
 def test_a_recording_that_is_none_is_refused_with_its_log(tmp_path: Path) -> None:
