@@ -21,7 +21,7 @@ from gnd.tile_store import sql_trials as trials
 
 BADLY, WELL = [400, 410, 390, 405, 395, 402, 398, 401], [785 + k for k in range(9)]
 
-pytestmark = pytest.mark.xdist_group("fleets")
+pytestmark = pytest.mark.xdist_group("shards")
 
 
 @pytest.fixture(scope="module")

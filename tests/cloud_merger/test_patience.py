@@ -198,7 +198,7 @@ def test_nobody_takes_the_word_that_waits_for_another(desk):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("fleets")
+@pytest.mark.xdist_group("shards")
 def test_a_real_shard_keeps_the_word_and_one_that_is_killed_is_asked(tmp_path, free_port):
     cloud, heard = Cloud(tmp_path, free_port), threading.Event()
     cloud.open()

@@ -17,7 +17,7 @@ from gnd.tile_store import sql_trials as trials
 
 BADLY, WELL = [400 + k for k in range(8)], [785 + k for k in range(9)]
 
-pytestmark = [pytest.mark.xdist_group("fleets"), pytest.mark.slow]
+pytestmark = [pytest.mark.xdist_group("shards"), pytest.mark.slow]
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.link.sending import SenderThread
 from gnd.vehicle_agent.report.packing import pack_measured
 
-pytestmark = pytest.mark.xdist_group("fleets")
+pytestmark = pytest.mark.xdist_group("shards")
 
 SHARDS = ("left", "right")
 FIRST = [TileId((TILE.morton & ~1023) + k * 1024 + 5) for k in range(8)]

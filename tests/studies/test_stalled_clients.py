@@ -7,7 +7,7 @@ from studies import outage, stalled
 MOST_S = 12.0
 """Beside other tests; on a machine that does nothing else it is a third of a second (docs/results.md)."""
 
-pytestmark = pytest.mark.xdist_group("fleets")
+pytestmark = pytest.mark.xdist_group("shards")
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from store_process import HURRY, TILES, merged_tile, publication_of
 from gnd.tile_store.location import open_store
 from gnd.tile_store.sqlite_store import SqlStore
 
-pytestmark = pytest.mark.xdist_group("fleets")
+pytestmark = pytest.mark.xdist_group("shards")
 
 SCRIPT = Path(__file__).with_name("store_process.py")
 KILLS = 20
