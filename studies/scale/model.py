@@ -151,7 +151,7 @@ class SimulatedRun:
     is_drained: bool = False
 
 
-class _Waiting:
+class _WaitingTiles:
     """Tiles that wait and that nobody has leased, by the time at which they are ready.
 
     Every poll of every shard asks it. What a tile's later times have overtaken is thrown away when it comes to the top.
@@ -198,8 +198,8 @@ class CloudModel:
         self._uploads: list[deque[tuple[SimulatedReport, float, bool]]] = [deque() for _ in range(rules.shards)]
         self._woken = [self._env.event() for _ in range(rules.shards)]
         self._dirty: dict[int, _Dirty] = {}
-        self._waiting = _Waiting(self._dirty)
-        self._own_waiting = [_Waiting(self._dirty) for _ in range(rules.shards)]
+        self._waiting = _WaitingTiles(self._dirty)
+        self._own_waiting = [_WaitingTiles(self._dirty) for _ in range(rules.shards)]
         self._window: Counter[int] = Counter()  # reports of each tile's open window
         self._open = 0  # reports that are not through
         self.run_ = SimulatedRun()
