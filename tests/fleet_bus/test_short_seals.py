@@ -194,7 +194,9 @@ def test_keys_of_the_same_terse_name_are_told_apart() -> None:
     for number in range(300):
         ours, digest = KeyHalf.make(), number.to_bytes(32, "big")
         share = granted.grant(ours.share, digest, SHARD, replace(VEHICLE, name=f"w{number}"))
-        askers.append(ours.agree(share, digest, SHARD, replace(VEHICLE, name=f"w{number}"), is_asker=True))
+        if share:  # names have three bytes: one of some hundred runs has two keys of the same, and grants no second
+            askers.append(ours.agree(share, digest, SHARD, replace(VEHICLE, name=f"w{number}"), is_asker=True))
+    assert len(askers) >= 298
     one, other = askers[7], askers[8]
     granted._of_terse[terse_id(one.key_id)] = [one.key_id, other.key_id]  # as if their names began alike
     seal = one.question(KEY, b"report", is_bare=False)
