@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Final
 
 from gnd.cloud_merger.expander_threads import working
@@ -76,7 +77,7 @@ class CatalogSigner:
         for layer in due_lists(self._store, self._publishers, before_s):
             if self._failed_lists_s.get(layer, 0.0) > time.monotonic():
                 continue
-            why = self._told(lambda layer=layer: sign_list(self._store, layer))  # type: ignore[misc]
+            why = self._told(partial(sign_list, self._store, layer))
             n += not why
             if why:
                 self._failed_lists_s[layer] = again_s
@@ -102,7 +103,7 @@ class CatalogSigner:
     def _whole(self, layer: str, districts: list[District]) -> int:
         n, again_s = 0, time.monotonic() + FAILED_AGAIN_S
         for district in districts:
-            why = self._told(lambda district=district: sign_whole_catalog(self._store, layer, district))  # type: ignore[misc]
+            why = self._told(partial(sign_whole_catalog, self._store, layer, district))
             n += not why
             if why:
                 self._failed_s[layer, district] = again_s

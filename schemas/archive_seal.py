@@ -36,6 +36,18 @@ class SealNumber:
     number: int = 0
 
 
+def check_signed_state(what: str, number: int, signed_s: int, signer: bytes, signature: bytes) -> None:
+    """`BadValue` unless these can be number, time, signer and signature of a state that is signed again and again."""
+    check_seconds(signed_s)
+    if not 1 <= number < MOST_NUMBER:
+        raise BadValue(f"{what} with number {number}: 1 .. {MOST_NUMBER - 1}")
+    if len(signer) != SIGNER_BYTES or len(signature) != SIGNATURE_BYTES:
+        raise BadValue(
+            f"{what} with a signature of {len(signature)} bytes by a signer of {len(signer)} bytes:"
+            f" {SIGNATURE_BYTES} and {SIGNER_BYTES}"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class ArchiveSeal:
     """A seal as it lies in a file.
@@ -55,15 +67,9 @@ class ArchiveSeal:
     signature: bytes
 
     def __post_init__(self) -> None:
-        check_seconds(self.signed_s)
-        if not 1 <= self.number < MOST_NUMBER:
-            raise BadValue(f"archive seal with number {self.number}: 1 .. {MOST_NUMBER - 1}")
-        sizes = len(self.archive), len(self.signer), len(self.signature)
-        if sizes != (ARCHIVE_ID_BYTES, SIGNER_BYTES, SIGNATURE_BYTES):
-            raise BadValue(
-                f"archive seal with {sizes[0]} bytes of archive, {sizes[1]} of signer and {sizes[2]} of signature:"
-                f" {ARCHIVE_ID_BYTES}, {SIGNER_BYTES} and {SIGNATURE_BYTES}"
-            )
+        check_signed_state("archive seal", self.number, self.signed_s, self.signer, self.signature)
+        if len(self.archive) != ARCHIVE_ID_BYTES:
+            raise BadValue(f"archive seal with {len(self.archive)} bytes of archive: {ARCHIVE_ID_BYTES}")
 
     @property
     def order(self) -> SealNumber:

@@ -11,10 +11,9 @@ from hashlib import sha256
 from typing import Final, Literal, Protocol
 
 from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District, TileId
-from gnd.schemas.archive_seal import SealNumber
+from gnd.schemas.archive_seal import SealNumber, check_signed_state
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import catalog_signature_pb2
-from gnd.schemas.version_signature import SIGNATURE_BYTES, SIGNER_BYTES, check_seconds
 from gnd.schemas.wire import LAYER_PATTERN, check_text, check_word, number_of, word_of
 
 GROUPS: Final = 32
@@ -22,7 +21,6 @@ TILES_OF_GROUP: Final = TILES_OF_DISTRICT // GROUPS
 DIGEST_BYTES: Final = 32
 NO_TILES: Final = bytes(DIGEST_BYTES)
 """Stands for a group without a tile."""
-MOST_NUMBER: Final = 2**48
 _TEXT: Final = b"gnd catalog 1"
 _GROUP: Final = b"\x00"
 _ROOT: Final = b"\x01"
@@ -167,14 +165,7 @@ class CatalogSignature:
 
     def __post_init__(self) -> None:
         check_word(self.kind, _KIND, "kind of catalog")
-        check_seconds(self.signed_s)
-        if not 1 <= self.number < MOST_NUMBER:
-            raise BadValue(f"catalog signature with number {self.number}: 1 .. {MOST_NUMBER - 1}")
-        if len(self.signer) != SIGNER_BYTES or len(self.signature) != SIGNATURE_BYTES:
-            raise BadValue(
-                f"catalog signature of {len(self.signature)} bytes by a signer of {len(self.signer)} bytes:"
-                f" {SIGNATURE_BYTES} and {SIGNER_BYTES}"
-            )
+        check_signed_state("catalog", self.number, self.signed_s, self.signer, self.signature)
 
     @property
     def order(self) -> SealNumber:

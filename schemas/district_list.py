@@ -12,10 +12,9 @@ from typing import Final
 
 from gnd.gnd_map.tile_id import TILES_OF_DISTRICT, District, TileId
 from gnd.schemas import limits
-from gnd.schemas.archive_seal import SealNumber
+from gnd.schemas.archive_seal import SealNumber, check_signed_state
 from gnd.schemas.errors import BadValue
 from gnd.schemas.generated import district_list_pb2
-from gnd.schemas.version_signature import SIGNATURE_BYTES, SIGNER_BYTES, check_seconds
 from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
@@ -28,12 +27,9 @@ from gnd.schemas.wire import (
     serialise,
 )
 
-MOST_NUMBER: Final = 2**48
 HEAD_ONLY: Final = b"\x01"
 """The payload of a question after a list without its districts."""
 _TEXT: Final = b"gnd districts 1"
-
-
 _NUMBERS: Final = 2**29
 """Of districts: the first fifteen base-4 digits of their tiles' paths, the first of which is 0 or 1."""
 
@@ -108,14 +104,7 @@ class DistrictsSignature:
     signature: bytes
 
     def __post_init__(self) -> None:
-        check_seconds(self.signed_s)
-        if not 1 <= self.number < MOST_NUMBER:
-            raise BadValue(f"list of districts with number {self.number}: 1 .. {MOST_NUMBER - 1}")
-        if len(self.signer) != SIGNER_BYTES or len(self.signature) != SIGNATURE_BYTES:
-            raise BadValue(
-                f"list of districts with a signature of {len(self.signature)} bytes by a signer of {len(self.signer)}"
-                f" bytes: {SIGNATURE_BYTES} and {SIGNER_BYTES}"
-            )
+        check_signed_state("list of districts", self.number, self.signed_s, self.signer, self.signature)
 
     @property
     def order(self) -> SealNumber:

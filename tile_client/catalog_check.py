@@ -7,12 +7,10 @@ it, and who has seen nothing yet sees how old it is.
 """
 
 import logging
-import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from gnd.fleet_bus.errors import NotAnsweredFor, SealError
 from gnd.fleet_bus.publishers import Publishers
 from gnd.fleet_bus.refusals import counted
 from gnd.fleet_bus.seldom import Seldom
@@ -22,6 +20,7 @@ from gnd.schemas.catalog_signature import CatalogSignature, CatalogStatement
 from gnd.schemas.errors import BadValue, NotSigned
 from gnd.schemas.tiles import Catalog, CatalogEntry
 from gnd.tile_client.archive_check import SeenStates
+from gnd.tile_client.signed_state import RefusedStateError, check_answered, check_order
 
 _SELDOM: Final = Seldom(logging.getLogger(__name__))
 NOTICED_AFTER_S: Final = 86_400.0
@@ -52,47 +51,31 @@ class CatalogCheck:
         """
         try:
             return self._check(layer, district, catalog)
-        except _RefusedCatalogError as refused:
+        except RefusedStateError as refused:
             counted("catalog", refused.reason)
             raise NotSigned(f"catalog of district {district} of layer {self._layer}: {refused}") from refused
 
     def _check(self, layer: str, district: District, catalog: Catalog) -> float:
         if layer != self._layer:
-            raise _RefusedCatalogError("wrong", f"is that of layer {layer[:40]}")
+            raise RefusedStateError("wrong", f"is that of layer {layer[:40]}")
         newest, signed = self._seen.newest(self._name(district)), catalog.signature
         if signed is None:
             if not catalog.entries and newest == SealNumber():
                 return 0.0  # nothing is mapped there, or the list of districts names it (`list_check`)
-            raise _RefusedCatalogError(
+            raise RefusedStateError(
                 "unsigned",
                 "nobody has signed it: the tile server or the shards may be of an older release (shards sign each"
                 " district when they start, `gnd map sign` does where there are none)",
             )
         try:
             statement = CatalogStatement.of(self._layer, district, catalog.entries)
-            self._publishers.check(signed.signer, signed.signed_s, signed.text(statement), signed.signature)
         except BadValue as error:
-            raise _RefusedCatalogError("wrong", str(error)) from error
-        except NotAnsweredFor as error:
-            raise _RefusedCatalogError(error.why, f"{error}; {len(catalog.entries)} tiles are named") from error
-        except SealError as error:
-            raise _RefusedCatalogError("unknown", str(error)) from error
+            raise RefusedStateError("wrong", str(error)) from error
+        check_answered(self._publishers, signed, signed.text(statement), f"{len(catalog.entries)} tiles")
         return self._check_order(district, signed, newest)
 
     def _check_order(self, district: District, signed: CatalogSignature, newest: SealNumber) -> float:
-        if signed.order < newest:
-            raise _RefusedCatalogError(
-                "older",
-                f"number {signed.number} was signed {newest.signed_s - signed.signed_s} s before number"
-                f" {newest.number}, which was seen before",
-            )
-        age_s = time.time() - signed.signed_s
-        if self._oldest_s is not None and age_s > self._oldest_s:
-            raise _RefusedCatalogError(
-                "too old",
-                f"number {signed.number} was signed {age_s / 3600:.1f} h ago, at most {self._oldest_s / 3600:.1f} h are"
-                " wanted: newer ones are withheld, or no shard has run since",
-            )
+        age_s = check_order(signed, newest, self._oldest_s)
         if age_s > NOTICED_AFTER_S:
             counted("catalog", "old")
             _SELDOM.warning(
@@ -117,14 +100,6 @@ class CatalogCheck:
 
     def _name(self, district: District) -> str:
         return f"{self._layer}/{district}"
-
-
-class _RefusedCatalogError(Exception):
-    """Why a catalog is not used, in a word and in a sentence."""
-
-    def __init__(self, reason: str, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
 
 
 def set_back(

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from gnd.fleet_bus.bus import Bus
-from gnd.fleet_bus.errors import NotAnsweredFor, SealError
 from gnd.fleet_bus.publishers import Publishers
 from gnd.fleet_bus.refusals import counted
 from gnd.fleet_bus.seldom import Seldom
@@ -20,6 +19,7 @@ from gnd.schemas.district_list import HEAD_ONLY, DistrictList, district_of
 from gnd.schemas.errors import NotSigned
 from gnd.schemas.keys import list_keys, parse_list_key
 from gnd.tile_client.archive_check import SeenStates
+from gnd.tile_client.signed_state import RefusedStateError, check_answered, check_order
 
 LIST_KEPT_S: Final = 60.0
 """A list is asked for again after so long, and when a district comes that it does not name."""
@@ -99,7 +99,7 @@ class ListCheck:
             try:
                 self._check(key, told, heads=heads)
                 good.append(told)
-            except _RefusedListError as error:
+            except RefusedStateError as error:
                 counted("catalog", f"list {error.reason}")
                 refused.append(f"list of districts of layer {self._layer}: {error}")
                 _SELDOM.warning("%s", refused[-1])
@@ -122,45 +122,14 @@ class ListCheck:
     def _check(self, key: str, told: DistrictList, *, heads: bool) -> None:
         layer, region = parse_list_key(key)
         if (layer, region) != (told.head.layer, told.head.region) or layer != self._layer:
-            raise _RefusedListError("wrong", f"is that of layer {told.head.layer}, region {told.head.region}")
+            raise RefusedStateError("wrong", f"is that of layer {told.head.layer}, region {told.head.region}")
         if told.numbers is None and not heads:
-            raise _RefusedListError("wrong", f"came without its {told.head.count} districts")
-        check_answered(self._publishers, told)
+            raise RefusedStateError("wrong", f"came without its {told.head.count} districts")
         signed, newest = told.signature, self._seen.newest(self._name(told))
-        if signed.order < newest:
-            raise _RefusedListError(
-                "older",
-                f"number {signed.number} of region {region} was signed {newest.signed_s - signed.signed_s} s before"
-                f" number {newest.number}, which was seen before",
-            )
-        age_s = time.time() - signed.signed_s
-        if self._oldest_s is not None and age_s > self._oldest_s:
-            raise _RefusedListError(
-                "too old",
-                f"number {signed.number} of region {region} was signed {age_s / 3600:.1f} h ago, at most"
-                f" {self._oldest_s / 3600:.1f} h are wanted: newer ones are withheld, or no shard has run since",
-            )
+        check_answered(self._publishers, signed, told.text, f"{told.head.count} districts")
+        check_order(signed, newest, self._oldest_s, f" of region {region}")
         self._seen.note(self._name(told), signed.order)
 
     @staticmethod
     def _name(told: DistrictList) -> str:
         return f"{told.head.layer}@{told.head.region}"
-
-
-def check_answered(publishers: Publishers, told: DistrictList) -> None:
-    """`_RefusedListError` where none of these publishers has signed a list, or its head, as it is."""
-    signed = told.signature
-    try:
-        publishers.check(signed.signer, signed.signed_s, told.text, signed.signature)
-    except NotAnsweredFor as error:
-        raise _RefusedListError(error.why, f"{error}; {told.head.count} districts are named") from error
-    except SealError as error:
-        raise _RefusedListError("unknown", str(error)) from error
-
-
-class _RefusedListError(Exception):
-    """Why a list is not used, in a word and in a sentence."""
-
-    def __init__(self, reason: str, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason

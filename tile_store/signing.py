@@ -207,6 +207,21 @@ def who_signed(c: SqlConnection, publishers: Publishers, stored: StoredTile) -> 
     return str(publishers.check(signed.signer, signed.signed_s, text, signed.signature))
 
 
+def who_answers(
+    c: SqlConnection, publishers: Publishers, signed: CatalogSignature | DistrictsSignature, text: bytes
+) -> str:
+    """Role and name of the publisher that has signed a text; the store may have the certificates.
+
+    Raises:
+        SealError: nobody has who may; why.
+    """
+    if not publishers.knows(signed.signer):
+        chain = chain_of(c, signed.signer)
+        if chain is not None:
+            publishers.learn(chain)
+    return str(publishers.check(signed.signer, signed.signed_s, text, signed.signature))
+
+
 def chain_of(c: SqlConnection, signer: bytes) -> bytes | None:
     """The certificates of somebody who has signed versions of the store; None: nobody of that id has."""
     rows = fetch(c, "chain_of_publisher", {"signer": signer})

@@ -33,7 +33,7 @@ from gnd.tile_store import sql_district_lists as lists
 from gnd.tile_store import sql_trials as trials
 from gnd.tile_store.connection import Row, SqlConnection, change, fetch, post
 from gnd.tile_store.errors import NotPublished
-from gnd.tile_store.signing import Signing, chain_of
+from gnd.tile_store.signing import Signing, who_answers
 from gnd.tile_store.values import VersionKind
 
 _SELDOM: Final = Seldom(logging.getLogger(__name__))
@@ -191,12 +191,7 @@ def who_signed_catalog(c: SqlConnection, publishers: Publishers, state: CatalogS
     Raises:
         SealError: nobody does who may; why.
     """
-    signed = state.signature
-    if not publishers.knows(signed.signer):
-        chain = chain_of(c, signed.signer)
-        if chain is not None:
-            publishers.learn(chain)
-    return str(publishers.check(signed.signer, signed.signed_s, signed.text(state.statement), signed.signature))
+    return who_answers(c, publishers, state.signature, state.signature.text(state.statement))
 
 
 def put(

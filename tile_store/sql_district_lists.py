@@ -19,7 +19,7 @@ from gnd.schemas.wire import VEHICLE_PATTERN
 from gnd.tile_store.connection import SqlConnection, change, fetch, post
 from gnd.tile_store.districts import DEFAULT_REGION
 from gnd.tile_store.errors import StoreBusy
-from gnd.tile_store.signing import Signing, chain_of
+from gnd.tile_store.signing import Signing, who_answers
 
 TRIES: Final = 16
 
@@ -51,12 +51,7 @@ def who_signed_list(c: SqlConnection, publishers: Publishers, told: DistrictList
     Raises:
         SealError: nobody does who may; why.
     """
-    signed = told.signature
-    if not publishers.knows(signed.signer):
-        chain = chain_of(c, signed.signer)
-        if chain is not None:
-            publishers.learn(chain)
-    return str(publishers.check(signed.signer, signed.signed_s, told.text, signed.signature))
+    return who_answers(c, publishers, told.signature, told.text)
 
 
 def is_good(c: SqlConnection, publishers: Publishers, told: DistrictList) -> bool:

@@ -29,7 +29,7 @@ class PlacedRays(NamedTuple):
 
     def packed(self) -> "PackedRays":
         """For waiting."""
-        return PackedRays.of(self.ends_m, self.starts_m)[0]
+        return PackedRays.of(self.ends_m, self.starts_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,12 +69,12 @@ class PackedRays:
         return self.points_m, starts
 
     @classmethod
-    def of(cls, points_m: F64, starts_m: F64) -> tuple["PackedRays", F32]:
-        """Pack ends and starts (N, 3), map frame; gives the starts from the centre, too, (N, 3) float32 [m]."""
+    def of(cls, points_m: F64, starts_m: F64) -> "PackedRays":
+        """Pack ends and starts (N, 3), map frame."""
         points, starts = np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(starts_m, np.float64)
         centre, near_points, near_starts, farthest_m = _centred(points, starts)
         step_m = max(float(farthest_m) / _LEVELS, _LEAST_STEP_M)
-        return cls(centre, near_points, *_runs(near_starts, step_m), step_m), near_starts
+        return cls(centre, near_points, *_runs(near_starts, step_m), step_m)
 
 
 @kernel

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from store_helpers import Clock, Maker, PostgresMaker, SqliteMaker
 
+from gnd.fleet_bus.identity.authority import Authority
+from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE, MemberName
 from gnd.tile_store.store import Store
 
 _NUMBERS = count()
@@ -50,3 +52,19 @@ def store(maker: Maker, clock: Clock) -> Iterator[Store]:
     opened = maker.open(clock=clock)
     yield opened
     opened.close()
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    """Of two shards, an operator and a vehicle."""
+    made = Authority.create(tmp_path_factory.mktemp("members") / "authority", "tests")
+    for role, name in (("shard", "s1"), ("shard", "s2"), ("operator", "anna"), ("vehicle", "v1")):
+        made.issue(MemberName(role, name), made.folder.parent / name)
+    return made
+
+
+@pytest.fixture
+def folder(authority: Authority, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """With a folder of each member's identity; this process has none."""
+    monkeypatch.setenv(IDENTITY_VARIABLE, "")
+    return authority.folder.parent

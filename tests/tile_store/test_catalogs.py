@@ -14,7 +14,7 @@ from gnd.cloud_merger.catalog_signer import CatalogSigner
 from gnd.cloud_merger.ownership import Members
 from gnd.deploy.map_cli import map_group
 from gnd.fleet_bus.identity.authority import Authority
-from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE, MemberName
+from gnd.fleet_bus.identity.names import MemberName
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.catalog_signature import CatalogSignature, CatalogStatement
@@ -44,20 +44,6 @@ TERMS = TrialTerms(0.5, 3600.0)
 
 
 pytestmark = pytest.mark.parametrize("maker", ["sqlite", "postgres"], indirect=True)
-
-
-@pytest.fixture(scope="module")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
-    made = Authority.create(tmp_path_factory.mktemp("catalogs") / "authority", "tests")
-    for role, name in (("shard", "s1"), ("shard", "s2"), ("operator", "anna"), ("vehicle", "v1")):
-        made.issue(MemberName(role, name), made.folder.parent / name)
-    return made
-
-
-@pytest.fixture
-def folder(authority: Authority, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(IDENTITY_VARIABLE, "")
-    return authority.folder.parent
 
 
 @pytest.fixture

@@ -29,20 +29,6 @@ pytestmark = pytest.mark.parametrize("maker", ["sqlite", "postgres"], indirect=T
 HOME, AWAY = (one.district.first_morton // TILES_OF_DISTRICT for one in (TILE, FAR))
 
 
-@pytest.fixture(scope="module")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
-    made = Authority.create(tmp_path_factory.mktemp("lists") / "authority", "tests")
-    for role, name in (("shard", "s1"), ("shard", "s2"), ("operator", "anna"), ("vehicle", "v1")):
-        made.issue(MemberName(role, name), made.folder.parent / name)
-    return made
-
-
-@pytest.fixture
-def folder(authority: Authority, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(IDENTITY_VARIABLE, "")
-    return authority.folder.parent
-
-
 @pytest.fixture
 def store(maker: Maker, folder: Path) -> Iterator[SqlStore]:
     with open_store(maker.location, signing=Signing(folder / "s1")) as opened:
