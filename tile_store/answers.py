@@ -13,7 +13,7 @@ from typing import Final, Literal
 from zlib import crc32
 
 from gnd.fleet_bus.errors import Refused
-from gnd.gnd_map.codec import CODECS, RANGE_CODECS, best_codec, codec_of, lattice_of
+from gnd.gnd_map.codec import CODECS, DELTA_CODECS, best_codec, codec_of, lattice_of
 from gnd.gnd_map.content import FEATURE_CODECS, AnyTile, codecs_of_layer, encode_content_delta, has_deltas
 from gnd.gnd_map.day import UNKNOWN_DAY
 from gnd.gnd_map.errors import CodecError, GndError
@@ -299,7 +299,7 @@ def reads_deltas(codec_id: int, codecs: Sequence[int]) -> bool:
     codec of its lattice, for deltas are range coded in one way.
     """
     return codec_id in codecs or any(
-        other in RANGE_CODECS and lattice_of(other) is lattice_of(codec_id) for other in codecs if codec_id in CODECS
+        other in DELTA_CODECS and lattice_of(other) is lattice_of(codec_id) for other in codecs if codec_id in CODECS
     )
 
 

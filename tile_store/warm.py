@@ -4,6 +4,8 @@ import numpy as np
 
 from gnd.gnd_map.codec import (
     LATTICES,
+    PREFERRED,
+    QUICK,
     best_codec,
     codec_of,
     decode_delta,
@@ -27,8 +29,8 @@ def warm_up() -> None:
     plain = Gaussians(ids, np.full(3, 90, np.int32), np.full(3, 40, np.int32), np.zeros((3, 3), np.float32), cov_m2)
     for lattice in LATTICES.values():
         gaussians = snap(plain, lattice)
-        codec = codec_of(best_codec(gaussians))
-        codec.decode(tile, codec.encode(tile, gaussians))
+        for codec in (codec_of(best_codec(gaussians, known)) for known in (PREFERRED, QUICK)):
+            codec.decode(tile, codec.encode(tile, gaussians))
         base = gaussians.take([0, 1])
         decode_delta(tile, base, encode_delta(tile, base, gaussians))
     decode_tiles(encode_tiles([(0, 1), (3, 0)]))

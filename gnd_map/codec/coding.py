@@ -50,7 +50,11 @@ class Coder:
         data, check = body[:-CHECK_BYTES], body[-CHECK_BYTES:]
         if checksum(data) != check:
             raise CodecError(f"{len(body)} bytes with checksum {check.hex()}, computed {checksum(data).hex()}: damaged")
-        data = data[head_bytes:]
+        return cls.over(priors, data[head_bytes:], five=five)
+
+    @classmethod
+    def over(cls, priors: Priors, data: bytes, *, five: bool = False) -> "Coder":
+        """A stream to read whose bytes have been checked already: `stream` of another coder."""
         coder = np.zeros(k.SLOTS, np.int64)
         coder[k.HIGH], coder[k.MODE], coder[k.AT] = 0xFFFFFFFF, 1, 4
         coder[k.CODE] = int.from_bytes(data[:4].ljust(4, b"\0"), "big")
@@ -81,11 +85,15 @@ class Coder:
         return found
 
     def finish(self, head: bytes = b"") -> bytes:
-        """The head, the bytes written, as few as tell the last interval, and the checksum of both."""
+        """The head, the stream, and the checksum of both."""
+        data = head + self.stream()
+        return data + checksum(data)
+
+    def stream(self) -> bytes:
+        """The bytes written, as few as tell the last interval."""
         self.check()
         coder, buffer = self.state[0], self.state[1]
-        data = head + buffer[: coder[k.AT]].tobytes() + _shortest(int(coder[k.LOW]), int(coder[k.HIGH]))
-        return data + checksum(data)
+        return buffer[: coder[k.AT]].tobytes() + _shortest(int(coder[k.LOW]), int(coder[k.HIGH]))
 
     def end(self) -> None:
         """`CodecError` unless the stream that was read ends here."""

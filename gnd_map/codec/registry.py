@@ -7,6 +7,7 @@ from types import MappingProxyType
 from gnd.gnd_map.codec.floats import CODEC_FLOAT32, decode_gaussians, encode_gaussians
 from gnd.gnd_map.codec.lattice import ARCHIVE, COMPACT, STANDARD, Lattice, is_on
 from gnd.gnd_map.codec.range_tile import decode_tile, decode_tile_by_set, encode_tile, encode_tile_by_set
+from gnd.gnd_map.codec.rans_tile import decode_tile_by_sums, encode_tile_by_sums
 from gnd.gnd_map.codec.zstd_columns import (
     decode_float_columns,
     decode_lattice_columns,
@@ -21,6 +22,7 @@ CODEC_FLOAT32_ZSTD = 1
 CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT = 2, 3, 4
 CODEC_ARCHIVE_ZSTD, CODEC_STANDARD_ZSTD, CODEC_COMPACT_ZSTD = 5, 6, 7
 CODEC_ARCHIVE_SETS, CODEC_STANDARD_SETS, CODEC_COMPACT_SETS = 8, 9, 10
+CODEC_ARCHIVE_SUMS, CODEC_STANDARD_SUMS, CODEC_COMPACT_SUMS = 11, 12, 13
 
 Encode = Callable[[TileId, Gaussians], bytes]
 Decode = Callable[[TileId, bytes], Gaussians]
@@ -62,6 +64,16 @@ def _sets_codec(codec_id: int, lattice: Lattice) -> Codec:
     return Codec(codec_id, f"{lattice.name}, range coded by sets", encode, decode, lattice)
 
 
+def _sums_codec(codec_id: int, lattice: Lattice) -> Codec:
+    def encode(tile_id: TileId, gaussians: Gaussians) -> bytes:
+        return encode_tile_by_sums(tile_id, gaussians, lattice)
+
+    def decode(tile_id: TileId, body: bytes) -> Gaussians:
+        return decode_tile_by_sums(tile_id, body, lattice)
+
+    return Codec(codec_id, f"{lattice.name}, by sums", encode, decode, lattice)
+
+
 def _zstd_codec(codec_id: int, lattice: Lattice) -> Codec:
     def encode(tile_id: TileId, gaussians: Gaussians) -> bytes:
         return encode_lattice_columns(codec_id, lattice, tile_id, gaussians)
@@ -84,15 +96,23 @@ _ALL = (
     _sets_codec(CODEC_ARCHIVE_SETS, ARCHIVE),
     _sets_codec(CODEC_STANDARD_SETS, STANDARD),
     _sets_codec(CODEC_COMPACT_SETS, COMPACT),
+    _sums_codec(CODEC_ARCHIVE_SUMS, ARCHIVE),
+    _sums_codec(CODEC_STANDARD_SUMS, STANDARD),
+    _sums_codec(CODEC_COMPACT_SUMS, COMPACT),
 )
 CODECS: Mapping[int, Codec] = MappingProxyType({codec.codec_id: codec for codec in _ALL})
 _ZSTD = (CODEC_COMPACT_ZSTD, CODEC_STANDARD_ZSTD, CODEC_ARCHIVE_ZSTD, CODEC_FLOAT32_ZSTD)
-PREFERRED = tuple(sorted(CODECS, key=lambda i: (i == CODEC_FLOAT32 or i in _ZSTD, -i)))
-"""All ids that this program reads, smallest bodies first."""
+_SUMS = (CODEC_COMPACT_SUMS, CODEC_STANDARD_SUMS, CODEC_ARCHIVE_SUMS)
+PREFERRED = tuple(sorted(set(CODECS) - set(_SUMS), key=lambda i: (i == CODEC_FLOAT32 or i in _ZSTD, -i)))
+"""The ids by which tiles are stored and asked for, smallest bodies first."""
+QUICK = (*_SUMS, *PREFERRED)
+"""All ids that this program reads, those first that need less time and more bytes: for who asks with time to save."""
 RANGE_CODECS = (
     CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT, CODEC_ARCHIVE_SETS, CODEC_STANDARD_SETS, CODEC_COMPACT_SETS
 )  # fmt: skip
-"""Who reads one of these reads the deltas of its lattice, which are coded in the same way."""
+"""Written decision by decision, each in its contexts."""
+DELTA_CODECS = (*RANGE_CODECS, *_SUMS)
+"""Who reads one of these reads the deltas of its lattice, which are coded as in `RANGE_CODECS`."""
 
 
 def codec_of(codec_id: int) -> Codec:

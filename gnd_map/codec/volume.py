@@ -202,9 +202,13 @@ class LaidOut:
 
     def code(self, coder: Coder) -> None:
         """Write them, or read them into the table."""
-        self.where[self.places] = -2
-        v.code_voxels(_coding(coder, self), 1 + self.n_known)
+        self.expect()
+        v.code_voxels(voxel_coding(coder, self), 1 + self.n_known)
         coder.check()
+
+    def expect(self) -> None:
+        """Note where a Gaussian will come."""
+        self.where[self.places] = -2
 
     def read(self) -> Quantised:
         """What stands in the table."""
@@ -260,7 +264,8 @@ def _sizes(lattice: Lattice) -> tuple[I64, I64]:
     return np.array(lattice.sd, np.int64), np.array(tops, np.int64)
 
 
-def _coding(coder: Coder, laid_out: LaidOut) -> v.VoxelCoding:
+def voxel_coding(coder: Coder, laid_out: LaidOut) -> v.VoxelCoding:
+    """What the voxels of the box are coded with."""
     lattice, grid, (_, ny, nx) = laid_out.lattice, laid_out.box.grid, laid_out.where.shape
     # 1/256 m: coarse enough that no machine's sine rounds it another way
     pitch = [round(size_m * 256) << (lattice.mean_bits - 8) for size_m in (grid.dx_m, grid.dy_m, grid.dz_m)]

@@ -214,7 +214,7 @@ def code_voxels(m: VoxelCoding, first: int) -> None:
 @bare_inlined
 def _code_axis(m: VoxelCoding, row: int, place: int) -> _Voxel:
     """The axis along which the Gaussian is thinnest, and what is known around it."""
-    table, known, refs = m.table, m.known, m.refs
+    table, known = m.table, m.known
     m.state[0][FIELD] = 1
     own_row, occupied = table[row, SELF], _occupied(m, place)
     n = _known_around(m, place, own_row)
@@ -225,6 +225,13 @@ def _code_axis(m: VoxelCoding, row: int, place: int) -> _Voxel:
     at = m.at + 2 * (first * 4 + second), m.at + 32 + 2 * occupied, m.at + 160 + 2 * (kind * 4 + own)
     axis = _axis_in(m, at, table[row, AXIS])
     table[row, AXIS] = axis
+    return _voxel_at(m, row, kind, axis, n, occupied)
+
+
+@bare_inlined
+def _voxel_at(m: VoxelCoding, row: int, kind: int, axis: int, n: int, occupied: int) -> _Voxel:
+    """What is known around a voxel of this axis; rows of `n` neighbours lie in `known`."""
+    table, known, refs = m.table, m.known, m.refs
     same = 0
     for i in range(n):
         refs[same] = known[i]

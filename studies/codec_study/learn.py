@@ -53,7 +53,7 @@ def main() -> None:
 def learnt_sets(maps: Sequence[tuple[TileId, Gaussians]], lattice: Lattice, n: int) -> list[Priors]:
     """The sets of a lattice; the one of all tiles is the first."""
     samples = [(tile_id, integers_of(snap(g, lattice, new_map=True), lattice)) for tile_id, g in maps]
-    every = learnt([*samples, *_with_other_counts(samples, lattice)], lattice, None)
+    every = learnt([*samples, *with_other_counts(samples, lattice)], lattice, None)
     heaps = np.array_split(np.argsort([np.median(q.level[:, 2]) for _, q in samples], kind="stable"), n)
     sets: list[Priors] = []
     for _ in range(ROUNDS):
@@ -97,7 +97,7 @@ def _size(priors: Priors, sample: Sample, lattice: Lattice) -> int:
     return len(written(tile_id, quantised, lattice, priors, five=True).finish())
 
 
-def _with_other_counts(samples: Sequence[Sample], lattice: Lattice) -> list[Sample]:
+def with_other_counts(samples: Sequence[Sample], lattice: Lattice) -> list[Sample]:
     """Tiles as they were rounded before numbers of points became coarser: up to one step of the lattice off."""
     if not lattice.map_counts:
         return []

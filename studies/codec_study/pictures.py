@@ -9,7 +9,7 @@ from studies.frame.figures import dress, finish, new_figure
 
 
 def draw(found: Mapping[str, Any], folder: Path) -> Path:
-    """One point a scene and codec: grey the older codecs, blue those by sets of tables; hollow what was learnt from."""
+    """One point a scene and codec: grey those without, blue those by sets of tables; hollow what was learnt from."""
     figure = new_figure(9.6, 5.6)
     axes = figure.subplots()
     for name, scene in found["scenes"].items():
@@ -27,7 +27,7 @@ def draw(found: Mapping[str, Any], folder: Path) -> Path:
     axes.set_xlim(left=1.5)
     dress(axes, "bytes a voxel", "95 % of pose shifts, cm")
     note = (
-        "blue: codecs 8 to 10, grey: 2 to 4; circles: recordings, hollow: learnt from, squares: simulated;"
+        "blue: codecs 8 to 10, grey: 2 to 4 and 11 to 13; circles: recordings, hollow: learnt from, squares: simulated;"
         " dashed: the standard codec's must on real streets"
     )
     return finish(figure, "What tiles weigh and what rounding costs", note, folder / "codec.png")

@@ -9,7 +9,7 @@ import numpy as np
 
 from gnd.fleet_sim.families.names import FAMILY_NAMES
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.codec import LATTICES, RANGE_CODECS, Codec, Lattice, codec_of, snap
+from gnd.gnd_map.codec import DELTA_CODECS, LATTICES, RANGE_CODECS, Codec, Lattice, codec_of, snap
 from gnd.gnd_map.codec.range_tile import spent_by_field
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import TileId
@@ -69,7 +69,7 @@ def _recorded(source: SceneSource, folder: Path, bench: Bench) -> CodecScene:
 
 
 def measured(scene: CodecScene) -> dict[str, Any]:
-    """Sizes, shifts and times of all range codecs on a scene, as plain values."""
+    """Sizes, shifts and times of all codecs that look at neighbours on a scene, as plain values."""
     poses = registered_poses(local_map_of(scene.grid_frame, scene.tiles), scene.scans)
     found: dict[str, Any] = {
         "kind": scene.kind,
@@ -82,7 +82,7 @@ def measured(scene: CodecScene) -> dict[str, Any]:
     for lattice in LATTICES.values():
         rounded = {tile_id: snap(g, lattice, new_map=True) for tile_id, g in scene.tiles.items()}
         shift = _quantiles(poses, registered_poses(local_map_of(scene.grid_frame, rounded), scene.scans))
-        for one in map(codec_of, RANGE_CODECS):
+        for one in map(codec_of, DELTA_CODECS):
             if one.lattice is lattice:
                 found["codecs"][one.name] = {"id": one.codec_id} | _sizes(one, lattice, rounded) | {"shift_cm": shift}
     return found
@@ -106,14 +106,16 @@ def _quantiles(before: list[F64 | None], after: list[F64 | None]) -> Shifts:
 
 
 def _sizes(one: Codec, lattice: Lattice, tiles: Maps) -> dict[str, Any]:
-    """Bytes a voxel, whole and by field; microseconds a voxel to write and to read, one core."""
+    """Bytes a voxel, whole and, of the range codecs, by field; microseconds a voxel to write and to read, one core."""
     n, total, fields, sets = sum(map(len, tiles.values())), 0, dict[str, float](), list[int]()
-    by_set = one.codec_id >= 8
+    is_range = one.codec_id in RANGE_CODECS
+    by_set = is_range and one.codec_id >= 8
     for tile_id, gaussians in tiles.items():
         body = one.encode(tile_id, gaussians)
         total += len(body)
         sets += [body[0]] if by_set else []
-        for name, spent in spent_by_field(tile_id, gaussians, lattice, body[0] if by_set else None).items():
+        spent_on = spent_by_field(tile_id, gaussians, lattice, body[0] if by_set else None) if is_range else {}
+        for name, spent in spent_on.items():
             fields[name] = fields.get(name, 0.0) + spent / n
     tile_id, largest = max(tiles.items(), key=lambda item: len(item[1]))
     encode_us, decode_us = _times_us(one, tile_id, largest)
@@ -146,7 +148,8 @@ def table_of(found: dict[str, Any]) -> Sheet:
             f"({same['p50']:.2f}", f"{same['p95']:.2f})", style="bold",
         )  # fmt: skip
         for codec_name, one in scene["codecs"].items():
-            parts = [f"{one['fields'][key]:.2f}" for key in ("voxels", "means", "covariances", "counts")]
+            fields = one["fields"]
+            parts = [f"{fields[x]:.2f}" if fields else "" for x in ("voxels", "means", "covariances", "counts")]
             shift = one["shift_cm"]
             table.add(
                 "", codec_name, f"{one['bytes']:.2f}", *parts, f"{shift['p50']:.2f}", f"{shift['p95']:.2f}",

@@ -11,6 +11,7 @@ from gnd.gnd_map.codec import (
     CODEC_FLOAT32_ZSTD,
     CODEC_STANDARD,
     CODEC_STANDARD_SETS,
+    CODEC_STANDARD_SUMS,
     CODEC_STANDARD_ZSTD,
     CODECS,
     LATTICES,
@@ -29,7 +30,7 @@ LAZ_STEP_M: Final = 0.01
 DRACO_BITS: Final = 14
 CLOUD_M: Final = 0.2
 TILE_VOXELS: Final = 2_500
-TILE_CODECS: Final = (CODEC_STANDARD, CODEC_STANDARD_ZSTD, CODEC_FLOAT32_ZSTD)
+TILE_CODECS: Final = (CODEC_STANDARD, CODEC_STANDARD_SUMS, CODEC_STANDARD_ZSTD, CODEC_FLOAT32_ZSTD)
 """Beside the one by which tiles are written."""
 NOT_HERE: Final = "not installed (extra `peers`)"
 

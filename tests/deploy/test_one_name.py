@@ -73,6 +73,7 @@ def test_the_wheel_holds_one_name_and_every_table(tmp_path: Path) -> None:
     for table in (
         "gnd_map/codec/priors.bin",
         "gnd_map/codec/prior_sets.bin",
+        "gnd_map/codec/rans_tables.bin",
         "deploy/fleet.toml",
         "tile_store/sql/sqlite.sql",
     ):

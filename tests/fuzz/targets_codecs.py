@@ -43,6 +43,7 @@ _READS = {
     "standard, columns, Zstandard": "gnd_map/codec/zstd_columns.py:decode_lattice_columns",
     "standard, range coded": "gnd_map/codec/range_tile.py:decode_tile",
     "standard, range coded by sets": "gnd_map/codec/range_tile.py:decode_tile_by_set",
+    "standard, by sums": "gnd_map/codec/rans_tile.py:decode_tile_by_sums",
 }
 
 

@@ -69,6 +69,7 @@ EXCEPTIONS = {
     "gnd_map/codec/coding.py:Coder.reading": "inside of every range-coded target",
     "gnd_map/codec/prior_sets.py:unpack": "tables that are part of the program",
     "gnd_map/codec/priors.py:unpack": "tables that are part of the program",
+    "gnd_map/codec/rans_tables.py:unpack": "tables that are part of the program",
     "gnd_map/sight.py:read_out": NOT_BYTES,
     "schemas/catalog_signature.py:decode_catalog_signature": OF_TARGET,
     "schemas/district_list.py:decode_district_list": OF_TARGET,

@@ -78,7 +78,7 @@ def _tile_decoder(codec_id: int, states: Sequence[Gaussians]) -> Decoder:
     def zstd_repaired(body: bytes) -> bytes:
         return seal(codec_id, TILE, struct.unpack_from("<I", body.ljust(4, b"\0"))[0], body[8:])
 
-    repaired = {0: bytes, **dict.fromkeys((2, 3, 4, 8, 9, 10), resealed)}.get(codec_id, zstd_repaired)
+    repaired = {0: bytes, **dict.fromkeys((2, 3, 4, *range(8, 14)), resealed)}.get(codec_id, zstd_repaired)
     return Decoder(codec.name, decode, [codec.encode(TILE, s) for s in fitting], repaired)
 
 

@@ -194,7 +194,7 @@ def test_columns_of_another_tile_are_refused(codec: Codec) -> None:
     assert len(codec.decode(SEOUL, body)) > 0
 
 
-@pytest.mark.parametrize("codec", [CODECS[i] for i in (2, 3, 4)], ids=lambda codec: codec.name)
+@pytest.mark.parametrize("codec", [CODECS[i] for i in (2, 3, 4, 12)], ids=lambda codec: codec.name)
 @by_tile
 def test_range_coded_bytes_of_another_tile_are_refused_or_give_gaussians_whose_hash_tells(
     codec: Codec, tile_id: TileId

@@ -14,9 +14,11 @@ from gnd.gnd_map.codec import (
     CODEC_FLOAT32_ZSTD,
     CODEC_STANDARD,
     CODEC_STANDARD_SETS,
+    CODEC_STANDARD_SUMS,
     CODEC_STANDARD_ZSTD,
     LATTICES,
     PREFERRED,
+    QUICK,
     encode_gaussians,
     snap,
 )
@@ -128,7 +130,8 @@ def test_who_cannot_read_deltas_gets_the_whole_tile(store: SqliteStore) -> None:
 
 
 @pytest.mark.parametrize(
-    "codec_id", [CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD_ZSTD, CODEC_STANDARD, CODEC_STANDARD_SETS]
+    "codec_id",
+    [CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD_ZSTD, CODEC_STANDARD, CODEC_STANDARD_SETS, CODEC_STANDARD_SUMS],
 )
 def test_a_client_that_reads_few_codecs_gets_the_tile_in_one_of_them(store: SqliteStore, codec_id: int) -> None:
     (tile,) = put(store, street(TILE, 1))
@@ -150,6 +153,8 @@ def test_the_first_codec_that_fits_is_taken_in_the_clients_order(store: SqliteSt
 
     assert codec_of(TILE, *PREFERRED) == CODEC_STANDARD_SETS
     assert codec_of(TILE, *BEFORE_SETS) == CODEC_STANDARD
+    assert codec_of(TILE, *QUICK) == CODEC_STANDARD_SUMS
+    assert not {11, 12, 13} & {codec_of(TILE, *PREFERRED), codec_of(TILE, *BEFORE_SETS)}
     assert codec_of(TILE, CODEC_FLOAT32, CODEC_STANDARD) == CODEC_FLOAT32
     assert codec_of(TILE, 2, 4, 7, CODEC_STANDARD_ZSTD, 0) == CODEC_STANDARD_ZSTD
     assert codec_of(EAST, *PREFERRED) == CODEC_FLOAT32_ZSTD
