@@ -28,12 +28,13 @@ _SET_BYTES: Final = _PLACES_BYTES + 4 * _WEIGHTS[0] * _WEIGHTS[1]
 
 def sets_of(lattice: str) -> tuple[Priors, ...]:
     """The sets of a lattice by their numbers."""
-    return _frozen()[lattice]
+    return _frozen(lattice)
 
 
-@lru_cache(maxsize=1)
-def _frozen() -> dict[str, tuple[Priors, ...]]:
-    return unpack(resources.files("gnd.gnd_map.codec").joinpath(FILE).read_bytes())
+@lru_cache(maxsize=len(LATTICES_WITH_SETS))
+def _frozen(lattice: str) -> tuple[Priors, ...]:
+    """Only those of one lattice: a vehicle's map has one, and those of all take 4 MB."""
+    return unpack(resources.files("gnd.gnd_map.codec").joinpath(FILE).read_bytes(), (lattice,))[lattice]
 
 
 def pack(sets: Mapping[str, Sequence[Priors]]) -> bytes:
@@ -48,15 +49,16 @@ def pack(sets: Mapping[str, Sequence[Priors]]) -> bytes:
     return zlib.compress(b"".join(parts), 9)
 
 
-def unpack(data: bytes) -> dict[str, tuple[Priors, ...]]:
-    """The sets of `pack`."""
+def unpack(data: bytes, wanted: Sequence[str] = LATTICES_WITH_SETS) -> dict[str, tuple[Priors, ...]]:
+    """The sets of `pack`, of the lattices that are wanted."""
     raw, at, found = zlib.decompress(data), 0, {}
     for name in LATTICES_WITH_SETS:
         n, at = raw[at], at + 1
-        planes = np.frombuffer(raw, np.uint8, n * _SET_BYTES, at).reshape(n, 4, -1)
-        rows = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<i4").reshape(n, -1).astype(np.int32)
-        rows[1:] ^= rows[0]
-        found[name] = tuple(map(_priors, rows))
+        if name in wanted:
+            planes = np.frombuffer(raw, np.uint8, n * _SET_BYTES, at).reshape(n, 4, -1)
+            rows = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<i4").reshape(n, -1).astype(np.int32)
+            rows[1:] ^= rows[0]
+            found[name] = tuple(map(_priors, rows))
         at += n * _SET_BYTES
     return found
 

@@ -173,6 +173,7 @@ def test_the_frozen_start_never_changes() -> None:
 def test_sets_are_read_from_their_file_as_they_were_written() -> None:
     sets = {name: sets_of(name) for name in prior_sets.LATTICES_WITH_SETS}
     again = prior_sets.unpack(prior_sets.pack(sets))
+    assert prior_sets.unpack(prior_sets.pack(sets), ("compact",)).keys() == {"compact"}
     for name, some in sets.items():
         assert 1 < len(some) <= prior_sets.MOST_SETS
         for one, other in zip(some, again[name], strict=True):

@@ -1,5 +1,6 @@
 """`gnd reproduce codec`: sizes by field, shifts, tables learnt from other tiles."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,19 @@ from click.testing import CliRunner
 from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.codec import LATTICES, codec_of, snap
+from gnd.gnd_map.codec.coding import Coder
 from gnd.gnd_map.codec.lattice import integers_of
-from gnd.gnd_map.codec.priors import Priors
+from gnd.gnd_map.codec.priors import Priors, priors_of
 from gnd.gnd_map.codec.range_tile import spent_by_field, written
+from gnd.gnd_map.codec.rans_tables import moves, sums_of
+from gnd.gnd_map.codec.rans_tile import numbers_written
+from gnd.gnd_map.codec.volume import NOTHING_KNOWN, LaidOut, box_of
 from gnd.gnd_map.errors import CodecError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile_id import TileId, covering_circle
 from studies.codec_study.learn import learnt, learnt_sets
+from studies.codec_study.learn_rans import first_moves, learnt_sums
 from studies.codec_study.scenes import LEARNT_FAMILIES, SOURCES, CodecScene
 from studies.codec_study.study import codec, measured, table_of
 
@@ -90,6 +96,25 @@ def test_a_set_writes_what_it_was_learnt_from_shorter_than_another(scene: CodecS
 def test_sets_are_learnt_one_for_all_and_one_a_heap(scene: CodecScene) -> None:
     maps = [*scene.tiles.items()] * 10
     assert len(learnt_sets(maps, LATTICES["archive"], 2)) == 3
+
+
+def test_sums_that_have_seen_a_place_write_it_shorter_than_the_frozen_ones(scene: CodecScene) -> None:
+    own = learnt_sums([*scene.tiles.items()] * 9, STANDARD, first_moves())
+    assert (np.diff(own.shares.astype(np.int64), axis=1) > 0).all()
+    sizes = dict.fromkeys(("own", "frozen"), 0)
+    for tile_id, g in scene.tiles.items():
+        q = integers_of(snap(g, STANDARD, new_map=True), STANDARD)
+        for name, sums in (("own", own), ("frozen", sums_of("standard"))):
+            laid_out = LaidOut.of(box_of(tile_id, q.voxel_id), q.voxel_id, NOTHING_KNOWN, STANDARD, q)
+            coder = Coder.writing(priors_of("tile-standard"), 64, five=True)
+            sizes[name] += len(numbers_written(coder, laid_out, sums))
+    assert sizes["own"] < 0.9 * sizes["frozen"]
+
+
+def test_the_frozen_moves_are_those_of_the_formulas() -> None:
+    for field in fields(moves()):
+        ours, frozen = (np.asarray(getattr(x, field.name), np.int64) for x in (first_moves(), moves()))
+        assert np.abs(ours - frozen).max() <= 1, field.name
 
 
 def test_the_tables_have_seen_neither_reserved_families_nor_most_recordings() -> None:
