@@ -42,6 +42,10 @@ _MANY_MISFITS: Final = 0.05
 """Share of voxels that do not fit from which on the search begins around the pose, too."""
 _AROUND_M: Final = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6), (0.0, -0.6))
 """Forward and left of the pose."""
+_POINTS_AROUND: Final = 1000
+"""So many points find out where the search from around the pose ends."""
+_SAME_M: Final = 0.04
+"""Ends nearer to each other, turns taken at `LEVER_M`, are one: half of the least shift that counts."""
 LEVER_M: Final = 25.0
 """Distance at which turns are measured: 0.2 degrees move a point there by 9 cm."""
 _REGISTRATION: Final = RegistrationParameters(rules=WITHOUT_WHEELS)
@@ -279,17 +283,35 @@ class _Voxels:
 
 
 def _candidates(points: F64, T: F64, match_map: MatchMap, *, wide: bool) -> list[RegistrationResult]:
-    """Where registration ends from the pose itself; and, if asked, with wide reach and from around it."""
-    starts: list[tuple[F64, Start]] = [(T, "near")]
-    if wide:
-        starts += [(T, "wide"), *((_beside(T, *step), "near") for step in _AROUND_M)]
-    found = []
+    """Where registration ends from the pose itself; and, if asked, with wide reach and from around it.
+
+    Most of these descents end at one pose. A few points tell which do not, and only those are followed with all points.
+    """
+    found = [one for one in [_registered(points, T, match_map, "near")] if one is not None]
+    if not wide:
+        return found
+    few = np.ascontiguousarray(points[:: max(1, len(points) // _POINTS_AROUND)])
+    starts: list[tuple[F64, Start]] = [(T, "wide"), *((_beside(T, *step), "near") for step in _AROUND_M)]
     for start, reach in starts:
-        try:
-            found.append(register(points, start, match_map, _REGISTRATION, reach))
-        except RegistrationError:
+        about = _registered(few, start, match_map, reach)
+        if about is None or any(_is_same(about, one) for one in found):
             continue
+        one = _registered(points, about.T_map_vehicle, match_map, "near")
+        if one is not None:
+            found.append(one)
     return found
+
+
+def _registered(points: F64, T: F64, match_map: MatchMap, reach: Start) -> RegistrationResult | None:
+    try:
+        return register(points, T, match_map, _REGISTRATION, reach)
+    except RegistrationError:
+        return None
+
+
+def _is_same(about: RegistrationResult, found: RegistrationResult) -> bool:
+    """Whether a few points ended where all points have ended from elsewhere."""
+    return Shift(T_inverse(found.T_map_vehicle) @ about.T_map_vehicle, 0, 0, 0, 0, 0.0, True).size_m < _SAME_M
 
 
 def _beside(T: F64, forward_m: float, left_m: float) -> F64:
