@@ -2,10 +2,12 @@
 
 import gtsam
 import numpy as np
+import pytest
 
 from gnd.gnd_map.se3 import exp_so3
 from gnd.vehicle_agent.localise.graph import GRAPH_ROBUST_K, MapMatch, OdometryEdge, PoseGraph, Position
 from gnd.vehicle_agent.localise.parameters import GraphParameters
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 STEP_NS = 100_000_000
 SIGMAS = np.array([3e-3, 3e-3, 6e-4, 0.01, 0.01, 0.02])
@@ -102,6 +104,74 @@ def test_agrees_with_one_batch_over_all_factors():
     for pose in final[3:]:
         expected = batch.atPose3(pose.number).matrix()
         np.testing.assert_allclose(pose.T_map_vehicle, expected, atol=2e-3)
+
+
+def everything_known(lag_s, n=40):
+    """A graph of noisy odometry, scans, matches and fixes, some of them wrong; and the same factors for GTSAM."""
+    rng, graph = np.random.default_rng(3), PoseGraph(GraphParameters(lag_s=lag_s))
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(GRAPH_ROBUST_K)
+
+    def robust(noise):
+        return gtsam.noiseModel.Robust.Create(cauchy, noise)
+
+    seen_covariance = np.diag([1e-3, 1e-3, 5e-4, 0.01, 0.008, 0.02]) ** 2
+    seen_covariance[2, 4] = seen_covariance[4, 2] = 2e-6
+    for k in range(n):
+        shift = 0.5 if k % 7 == 3 else 0.015
+        match = MapMatch(noisy(rng, true_pose(k), shift), MATCH_COVARIANCE) if k % 3 != 1 else None
+        fix = Position(true_pose(k)[:3, 3] + rng.normal(0.0, 0.3, 3), 0.2) if k % 5 == 0 else None
+        odometry = OdometryEdge(noisy(rng, step(k), 0.01, 1e-3), SIGMAS) if k else None
+        scans = ScanStep(noisy(rng, step(k), 0.01, 5e-4), seen_covariance) if k and k % 4 else None
+        graph.add(k * STEP_NS, true_pose(k), odometry, match, fix, scans)
+        values.insert(k, gtsam.Pose3(true_pose(k)))
+        if match is not None:
+            noise = robust(gtsam.noiseModel.Gaussian.Covariance(MATCH_COVARIANCE))
+            factors.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(match.T_map_vehicle), noise))
+        if fix is not None:
+            noise = robust(gtsam.noiseModel.Diagonal.Sigmas(0.2 * 5.0 * np.array([1.0, 1.0, 2.0])))
+            factors.add(gtsam.GPSFactor(k, fix.p_map_m, noise))
+        if odometry is not None:
+            noise = gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
+            factors.add(gtsam.BetweenFactorPose3(k - 1, k, gtsam.Pose3(odometry.T_before_now), noise))
+        if scans is not None:
+            noise = robust(gtsam.noiseModel.Gaussian.Covariance(seen_covariance))
+            factors.add(gtsam.BetweenFactorPose3(k - 1, k, gtsam.Pose3(scans.T_before_now), noise))
+    return graph, factors, values
+
+
+def test_agrees_with_gtsam_about_everything_that_can_be_known():
+    graph, factors, values = everything_known(lag_s=10.0)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-12)
+    batch = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
+    marginals = gtsam.Marginals(factors, batch)
+    for found in graph.flush():
+        np.testing.assert_allclose(found.T_map_vehicle, batch.atPose3(found.number).matrix(), atol=5e-4)
+        np.testing.assert_allclose(found.covariance, marginals.marginalCovariance(found.number), rtol=0.02, atol=1e-7)
+
+
+def test_what_has_left_the_graph_is_not_forgotten():
+    whole, short = (everything_known(lag_s)[0] for lag_s in (10.0, 0.5))
+    assert len(short) == 6
+    for here, there in zip(short.flush(), whole.flush()[-6:], strict=True):
+        np.testing.assert_allclose(here.T_map_vehicle, there.T_map_vehicle, atol=2e-3)
+        np.testing.assert_allclose(here.covariance, there.covariance, rtol=0.1, atol=1e-6)
+
+
+def test_a_graph_that_nothing_ties_to_the_map_is_refused():
+    with pytest.raises(np.linalg.LinAlgError, match="1 poses are singular"):
+        PoseGraph(GraphParameters()).add(0, np.eye(4), None, None, None)
+
+
+def test_a_graph_begins_anew_at_a_corrected_pose():
+    graph, _, _ = everything_known(lag_s=10.0)
+    corrected = noisy(np.random.default_rng(1), true_pose(39), 0.3)
+    graph.restart(corrected, MATCH_COVARIANCE)
+    assert len(graph) == 1
+    (one,) = graph.smoothed(39)
+    np.testing.assert_allclose(one.T_map_vehicle, corrected, atol=1e-12)
+    np.testing.assert_allclose(one.covariance, MATCH_COVARIANCE, atol=1e-12)
 
 
 def test_covariance_is_what_the_errors_are():

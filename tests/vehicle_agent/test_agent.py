@@ -135,14 +135,14 @@ def test_an_agent_killed_on_the_way_is_started_again_and_loses_nothing(cloud_of:
 
 
 @pytest.mark.slow
-def test_a_vehicle_with_lidar_asks_for_no_scipy(cloud_of: Cloud, config: AgentConfig) -> None:
+def test_a_vehicle_with_lidar_asks_for_neither_scipy_nor_gtsam(cloud_of: Cloud, config: AgentConfig) -> None:
     """Whoever asks for it is told; numba does where it compiles, and that is not ours."""
     program = """
 import sys
 asked = set()
 class Watch:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("scipy", "small_gicp"):
+        if name.split(".")[0] in ("scipy", "small_gicp", "gtsam"):
             frame = sys._getframe(1)
             while "importlib" in frame.f_code.co_filename:
                 frame = frame.f_back

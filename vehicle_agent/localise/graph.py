@@ -1,12 +1,12 @@
-"""The pose graph: a fixed-lag smoother over the last seconds of poses (GTSAM, built-in factors only)."""
+"""The pose graph: a fixed-lag smoother over the last seconds of poses."""
 
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import gtsam
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.localise.graph_kernels import MATCH, ODOMETRY, SCANS, settle_chain
 from gnd.vehicle_agent.localise.parameters import GraphParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
@@ -17,7 +17,10 @@ _GNSS_VERTICAL: Final = 2.0
 GRAPH_ROBUST_K: Final = 2.0
 """Cauchy scale of map matches and GNSS, in sigmas."""
 
-SLACK_S = 0.01
+_MOST_STEPS: Final = 10
+_STOP_M: Final = 1e-4
+_STOP_RAD: Final = 1e-5
+"""Of Gauss-Newton: at most so many steps, until no pose moves by so much."""
 
 
 class OdometryEdge(NamedTuple):
@@ -62,16 +65,67 @@ class SmoothedPose:
     axle_variance: float | None = None
 
 
+class _Known(NamedTuple):
+    """What is measured of N poses in a row, as `chain_equations` takes it: `measured` (N, 3, 4, 4), `information`
+    (N, 3, 6, 6), `fix_m` (N, 3), `fix_information` (N, 3).
+    """
+
+    measured: F64
+    information: F64
+    fix_m: F64
+    fix_information: F64
+
+    @classmethod
+    def of(
+        cls, odometry: OdometryEdge | None, scans: ScanStep | None, match: MapMatch | None, gnss: Position | None
+    ) -> "_Known":
+        """Of one pose."""
+        known = cls(np.zeros((1, 3, 4, 4)), np.zeros((1, 3, 6, 6)), np.zeros((1, 3)), np.zeros((1, 3)))
+        if odometry is not None:
+            known.measured[0, ODOMETRY] = odometry.T_before_now
+            known.information[0, ODOMETRY] = np.diag(1.0 / np.square(odometry.sigmas))
+        if scans is not None:
+            known.measured[0, SCANS] = scans.T_before_now
+            known.information[0, SCANS] = np.linalg.inv(scans.covariance)
+        if match is not None:
+            known.measured[0, MATCH] = match.T_map_vehicle
+            known.information[0, MATCH] = np.linalg.inv(match.covariance)
+        if gnss is not None:
+            sigma_m = gnss.sigma_m * _GNSS_INFLATION * np.array([1.0, 1.0, _GNSS_VERTICAL])
+            known.fix_m[0], known.fix_information[0] = gnss.p_map_m, 1.0 / sigma_m**2
+        return known
+
+    def and_then(self, more: "_Known") -> "_Known":
+        """These poses, and others behind them."""
+        return _Known(*(np.concatenate(both) for both in zip(self, more, strict=True)))
+
+    def later(self, n: int) -> "_Known":
+        """Without the first n poses."""
+        return _Known(*(of[n:] for of in self))
+
+
+class _Belief(NamedTuple):
+    """What is known of the first pose by all that has left the graph: information (6, 6) and gradient (6,) at a pose
+    (4, 4).
+    """
+
+    T_map_vehicle: F64
+    information: F64
+    gradient: F64
+
+
 class PoseGraph:
-    """Poses of the last `lag_s` seconds, tied by odometry, map matches and GNSS; the oldest leave it as final."""
+    """Poses of the last `lag_s` seconds, tied by odometry, map matches and GNSS; the oldest leave it as final.
+
+    What has left is remembered as a belief about the oldest pose that stays (Schur complement).
+    """
 
     def __init__(self, parameters: GraphParameters) -> None:
         self.parameters = parameters
-        # A little longer than our lag, so that a pose is taken out before the smoother forgets it.
-        self._smoother = gtsam.BatchFixedLagSmoother(parameters.lag_s + SLACK_S)
-        self._solved: tuple[gtsam.Values, gtsam.Marginals] | None = None  # since the last update
+        self._T, self._covariance = np.empty((0, 4, 4)), np.empty((0, 6, 6))
+        self._known = _Known.of(None, None, None, None).later(1)
+        self._belief = _Belief(np.eye(4), np.zeros((6, 6)), np.zeros(6))
         self._t_ns: dict[int, int] = {}
-        self._first_ns = 0
         self._next = 0
 
     def __len__(self) -> int:
@@ -93,39 +147,35 @@ class PoseGraph:
     ) -> list[SmoothedPose]:
         """Add the pose at `t_ns`, optimisation starting at `T_start` (4, 4); give the poses that leave the lag, oldest
         first. The first pose has no odometry.
+
+        Raises:
+            LinAlgError: nothing ties the poses to the map.
         """
-        number, factors, values = self._next, gtsam.NonlinearFactorGraph(), gtsam.Values()
-        values.insert(number, gtsam.Pose3(T_start))
-        if odometry is not None:
-            drift = gtsam.noiseModel.Diagonal.Sigmas(odometry.sigmas)
-            factors.add(gtsam.BetweenFactorPose3(number - 1, number, gtsam.Pose3(odometry.T_before_now), drift))
-        if scans is not None:
-            seen = self._robust(gtsam.noiseModel.Gaussian.Covariance(scans.covariance))
-            factors.add(gtsam.BetweenFactorPose3(number - 1, number, gtsam.Pose3(scans.T_before_now), seen))
-        if match is not None:
-            noise = self._robust(gtsam.noiseModel.Gaussian.Covariance(match.covariance))
-            factors.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(match.T_map_vehicle), noise))
-        if gnss is not None:
-            factors.add(gtsam.GPSFactor(number, gnss.p_map_m, self._gnss_noise(gnss.sigma_m)))
         final = self._leaving(t_ns)
-        if number == 0:
-            self._first_ns = t_ns
-        self._t_ns[number] = t_ns
+        self._known = self._known.and_then(_Known.of(odometry, scans, match, gnss))
+        self._T = np.concatenate([self._T, T_start[None]])
+        self._t_ns[self._next] = t_ns
         self._next += 1
-        self._smoother.update(factors, values, {number: (t_ns - self._first_ns) * 1e-9})
-        self._solved = None
+        self._settle(len(final))
         return final
 
     def restart(self, T_map_vehicle: F64, covariance: F64) -> None:
         """Forget everything but the newest pose, and hold that to be (4, 4) with covariance (6, 6)."""
-        number, factors, values = self.newest, gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pose = gtsam.Pose3(T_map_vehicle)
-        values.insert(number, pose)
-        factors.add(gtsam.PriorFactorPose3(number, pose, gtsam.noiseModel.Gaussian.Covariance(covariance)))
+        number = self.newest
         self._t_ns = {number: self._t_ns[number]}
-        self._smoother = gtsam.BatchFixedLagSmoother(self.parameters.lag_s + SLACK_S)
-        self._smoother.update(factors, values, {number: (self._t_ns[number] - self._first_ns) * 1e-9})
-        self._solved = None
+        self._T, self._known = T_map_vehicle[None].copy(), _Known.of(None, None, None, None)
+        self._belief = _Belief(T_map_vehicle.copy(), np.linalg.inv(covariance), np.zeros(6))
+        self._settle()
+
+    def _settle(self, gone: int = 0) -> None:
+        """Let go of the first poses, and place the others anew."""
+        self._covariance = np.empty((len(self._T) - gone, 6, 6))
+        if not settle_chain(
+            self._T, *self._known, *self._belief, gone, GRAPH_ROBUST_K**2, _MOST_STEPS, _STOP_M, _STOP_RAD,
+            self._covariance,
+        ):  # fmt: skip
+            raise np.linalg.LinAlgError(f"the normal equations of {len(self._T)} poses are singular")
+        self._T, self._known = self._T[gone:], self._known.later(gone)
 
     def _leaving(self, now_ns: int) -> list[SmoothedPose]:
         return self._take([n for n, t in self._t_ns.items() if now_ns - t > self.parameters.lag_s * 1e9])
@@ -136,31 +186,18 @@ class PoseGraph:
 
     def pose(self, number: int) -> F64:
         """(4, 4) present estimate of a pose inside the lag."""
-        return np.asarray(self._smoother.calculateEstimatePose3(number).matrix())
+        return np.array(self._T[self._at(number)])
 
     def smoothed(self, *numbers: int) -> list[SmoothedPose]:
         """Poses inside the lag with their marginal covariances."""
-        if not numbers:
-            return []
-        if self._solved is None:
-            estimate = self._smoother.calculateEstimate()
-            self._solved = estimate, gtsam.Marginals(self._smoother.getFactors(), estimate)
-        poses, marginals = self._solved
-        return [
-            SmoothedPose(n, self._t_ns[n], poses.atPose3(n).matrix(), np.asarray(marginals.marginalCovariance(n)))
-            for n in numbers
-        ]
+        return [SmoothedPose(n, self._t_ns[n], self.pose(n), self._covariance[self._at(n)].copy()) for n in numbers]
+
+    def _at(self, number: int) -> int:
+        """Where a pose inside the lag stands."""
+        return number - (self._next - len(self._T))
 
     def _take(self, numbers: list[int]) -> list[SmoothedPose]:
         poses = self.smoothed(*numbers)
         for number in numbers:
             del self._t_ns[number]
         return poses
-
-    def _gnss_noise(self, sigma_m: float) -> gtsam.noiseModel.Base:
-        axes = np.array([1.0, 1.0, _GNSS_VERTICAL])
-        return self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma_m * _GNSS_INFLATION * axes))
-
-    def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(GRAPH_ROBUST_K)
-        return gtsam.noiseModel.Robust.Create(cauchy, noise)
