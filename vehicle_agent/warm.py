@@ -21,7 +21,7 @@ from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.trial import Trial
 from gnd.vehicle_agent.features.poles.detector import PoleDetector
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise.clock import solve_chain
+from gnd.vehicle_agent.localise.clock import MotionSignal, solve_chain
 from gnd.vehicle_agent.localise.co_moving import LEAST_SWEEPS, CoMoving
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.localiser import Localiser
@@ -63,7 +63,8 @@ def warm_up() -> None:
     _rolled(points)
     _stretched(local_map, points)
     _beside_others(points)
-    solve_chain(np.zeros(1), np.ones(2), np.zeros((2, 6)))  # clocks are compared only where a vehicle drives
+    MotionSignal.of(np.arange(3.0), np.zeros(3), np.zeros(3)).rates(np.ones(1))  # clocks are compared where one drives
+    solve_chain(np.zeros(1), np.ones(2), np.zeros((2, 6)))
     _segment(points, refined[-1].estimate if refined else None)
     _find_poles(points)
     detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))

@@ -7,7 +7,15 @@ from hypothesis import strategies as st
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
-from gnd.vehicle_agent.localise.clock import MOST_S, PRIOR_S, SHARED, ClockEstimator, _whitened, solve_chain
+from gnd.vehicle_agent.localise.clock import (
+    MOST_S,
+    PRIOR_S,
+    SHARED,
+    ClockEstimator,
+    MotionSignal,
+    _whitened,
+    solve_chain,
+)
 from gnd.vehicle_agent.localise.odometry import ClockModel, MotionBuffer
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
@@ -228,3 +236,16 @@ def test_a_chain_of_steps_is_solved_as_scipys_banded_cholesky_does():
         expected = cho_solve_banded((cholesky_banded(band), False), columns)
         solve_chain(beside, np.ones(n), columns)
         np.testing.assert_allclose(columns, expected, rtol=0.0, atol=1e-14)
+
+
+def test_integrals_of_samples_are_those_of_straight_lines_between_them():
+    rng = np.random.default_rng(2)
+    t = np.cumsum(rng.uniform(0.01, 0.03, 80))
+    speed, yaw_rate = rng.normal(9.0, 1.0, 80), rng.normal(0.0, 0.2, 80)
+    signal = MotionSignal.of(t, speed, yaw_rate)
+    at = np.concatenate([[t[0], t[-1], t[40]], rng.uniform(t[0] - 0.5, t[-1] + 0.5, 60)])
+    for found, y in zip(signal.integrals(at), (speed, yaw_rate), strict=True):
+        for integral, end in zip(found, at, strict=True):
+            knots = np.unique(np.concatenate([[t[0], end], t[(t > min(t[0], end)) & (t < max(t[0], end))]]))
+            plain = np.trapezoid(np.interp(knots, t, y), knots) * (1.0 if end >= t[0] else -1.0)
+            assert integral == pytest.approx(plain, abs=1e-11)

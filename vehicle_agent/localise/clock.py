@@ -96,15 +96,36 @@ class ClockStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionSignal:
-    """Speed and yaw rate as measured, N samples, and their integrals; time in seconds after some moment."""
+    """Speed and yaw rate as measured, N samples, and their integrals; time in seconds after some moment.
+
+    Attributes:
+        t_s, speed_mps, yaw_rate_radps: (N,).
+        way_m, turn_rad: (N,) since the first sample, straight lines between the samples.
+        period_s: between two samples.
+        variance: (2,) of the noise of speed and yaw rate, from neighbouring samples.
+    """
 
     t_s: F64
     speed_mps: F64
     yaw_rate_radps: F64
+    way_m: F64
+    turn_rad: F64
+    period_s: float
+    variance: F64
+
+    @classmethod
+    def of(cls, t_s: F64, speed_mps: F64, yaw_rate_radps: F64) -> "MotionSignal":
+        """From samples (N,) in time order."""
+        second = np.diff(np.stack([speed_mps, yaw_rate_radps], axis=1), 2, axis=0)
+        variance = np.median(second**2, axis=0) / (6.0 * MEDIAN_OF_SQUARE)
+        way_m, turn_rad = _running_integral(t_s, speed_mps), _running_integral(t_s, yaw_rate_radps)
+        return cls(t_s, speed_mps, yaw_rate_radps, way_m, turn_rad, float(np.median(np.diff(t_s))), variance)
 
     def integrals(self, at_s: F64) -> tuple[F64, F64]:
-        """Way [m] and turn [rad] since the first sample at times (M,), straight lines between the samples."""
-        return _integral(self.t_s, self.speed_mps, at_s), _integral(self.t_s, self.yaw_rate_radps, at_s)
+        """Way [m] and turn [rad] since the first sample at times (M,); the ends are continued level."""
+        way_m, turn_rad = np.empty(len(at_s)), np.empty(len(at_s))
+        integrals_at(self.t_s, self.speed_mps, self.yaw_rate_radps, self.way_m, self.turn_rad, at_s, way_m, turn_rad)
+        return way_m, turn_rad
 
     def rates(self, at_s: F64) -> tuple[F64, F64]:
         """Speed [m/s] and yaw rate [rad/s] at times (M,), means over `2 * _HALF_S`."""
@@ -112,12 +133,9 @@ class MotionSignal:
         return (after[0] - before[0]) / (2 * _HALF_S), (after[1] - before[1]) / (2 * _HALF_S)
 
     def noise_of_changes(self, step_s: float) -> F64:
-        """(2,) variances that noise alone gives the changes of `rates` over a step, from neighbouring samples."""
-        period_s = float(np.median(np.diff(self.t_s)))
-        window, out = 2.0 * _HALF_S / period_s, min(step_s, 2.0 * _HALF_S) / period_s
-        second = np.diff(np.stack([self.speed_mps, self.yaw_rate_radps], axis=1), 2, axis=0)
-        variance = np.median(second**2, axis=0) / (6.0 * MEDIAN_OF_SQUARE)
-        return np.asarray(2.0 * out / window**2 * variance)
+        """(2,) variances that noise alone gives the changes of `rates` over a step."""
+        window, out = 2.0 * _HALF_S / self.period_s, min(step_s, 2.0 * _HALF_S) / self.period_s
+        return np.asarray(2.0 * out / window**2 * self.variance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,7 +235,7 @@ class ClockEstimator:
 
     def _signal(self, zero_ns: int) -> MotionSignal:
         t_ns, speed, yaw_rate = self._motion.samples(zero_ns - 2 * round(SEARCH_S * 1e9))
-        return MotionSignal(np.asarray((t_ns - zero_ns) * 1e-9, np.float64), speed, yaw_rate)
+        return MotionSignal.of(np.asarray((t_ns - zero_ns) * 1e-9, np.float64), speed, yaw_rate)
 
     def _prior(self, at_ns: int) -> OffsetPrior:
         known = None if self._old is None else self._old.later(at_ns)
@@ -378,12 +396,29 @@ def solve_chain(beside: F64, diagonal: F64, columns: F64) -> None:
             columns[i, k] /= diagonal[i]
 
 
-def _integral(t: F64, y: F64, at: F64) -> F64:
-    """(M,) the integral of straight lines through (t, y) (N,) from t[0] to `at` (M,); the ends are continued level."""
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    within = np.clip(at, t[0], t[-1])
-    after = within - t[k]
-    slope = (y[k + 1] - y[k]) / (t[k + 1] - t[k])
-    beyond = np.where(at > t[-1], (at - t[-1]) * y[-1], 0.0) + np.where(at < t[0], (at - t[0]) * y[0], 0.0)
-    return np.asarray(total[k] + y[k] * after + 0.5 * slope * after**2 + beyond)
+def _running_integral(t: F64, y: F64) -> F64:
+    """(N,) the integral of straight lines through (t, y) (N,) from t[0] on."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
+
+
+@bare
+def integrals_at(
+    t: F64, speed: F64, yaw_rate: F64, way: F64, turn: F64, at: F64, way_at: F64, turn_at: F64
+) -> None:  # fmt: skip
+    """Fill `way_at` and `turn_at` (M,) with the integrals of straight lines through speed and yaw rate (N,) from t[0] to
+    the times `at` (M,), of which `way` and `turn` (N,) are those to t (N,). The ends are continued level.
+    """
+    last, k = t.shape[0] - 1, 0
+    for m in range(at.shape[0]):
+        while k < last - 1 and t[k + 1] <= at[m]:
+            k += 1
+        while k > 0 and t[k] > at[m]:
+            k -= 1
+        after, span = min(max(at[m], t[0]), t[last]) - t[k], t[k + 1] - t[k]
+        before_s, beyond_s = min(at[m] - t[0], 0.0), max(at[m] - t[last], 0.0)
+        half = 0.5 * ((speed[k + 1] - speed[k]) / span)
+        way_at[m] = way[k] + speed[k] * after + half * (after * after)
+        way_at[m] += beyond_s * speed[last] + before_s * speed[0]
+        half = 0.5 * ((yaw_rate[k + 1] - yaw_rate[k]) / span)
+        turn_at[m] = turn[k] + yaw_rate[k] * after + half * (after * after)
+        turn_at[m] += beyond_s * yaw_rate[last] + before_s * yaw_rate[0]
