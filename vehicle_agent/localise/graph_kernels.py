@@ -9,7 +9,13 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.jit import bare, kernel
-from gnd.vehicle_agent.localise.kernels import cholesky
+from gnd.vehicle_agent.localise.chain_kernels import (
+    chain_covariances,
+    factor_chain,
+    inverse_of,
+    solve_chain_columns,
+    through_pose,
+)
 from gnd.vehicle_agent.localise.stretch_kernels import motion, move
 
 ODOMETRY, SCANS, MATCH = range(3)
@@ -145,95 +151,6 @@ def chain_equations(
             _add_fix(T[n], fix_m[n], fix_information[n], k2, D[n], g[n])
 
 
-@bare
-def _inverse(S: F64, L: F64, out: F64) -> bool:
-    """Fill `out` (6, 6) with the inverse of a symmetric S; L (6, 6) is room. False where S is not positive definite."""
-    if not cholesky(S, 0.0, L):
-        return False
-    for c in range(6):
-        for r in range(6):
-            rest = 1.0 if r == c else 0.0
-            for k in range(r):
-                rest -= L[r, k] * out[k, c]
-            out[r, c] = rest / L[r, r]
-        for r in range(5, -1, -1):
-            for k in range(r + 1, 6):
-                out[r, c] -= L[k, r] * out[k, c]
-            out[r, c] /= L[r, r]
-    return True
-
-
-@bare
-def _take_through(U: F64, inverse: F64, through: F64, x: F64, S: F64, rest: F64) -> None:
-    """Take from S (6, 6) and rest (6,) what goes through an eliminated pose: U' `inverse` U and U' `inverse` x; `through`
-    (6, 6) is room.
-    """
-    for r in range(6):
-        for c in range(6):
-            through[r, c] = 0.0
-            for k in range(6):
-                through[r, c] += U[k, r] * inverse[k, c]
-    for r in range(6):
-        for k in range(6):
-            rest[r] -= through[r, k] * x[k]
-            for c in range(6):
-                S[r, c] -= through[r, k] * U[k, c]
-
-
-@kernel
-def solve_poses(D: F64, U: F64, g: F64, x: F64, inverse: F64) -> bool:
-    """Fill x (N, 6) with the solution of the equations of `chain_equations`, by elimination from the first pose on.
-
-    `inverse` (N, 6, 6), filled: of what is left of each block of the diagonal when the poses before are eliminated; the
-    last one is the covariance of the newest pose. False where the equations are singular.
-    """
-    S, L, through = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6))
-    last = D.shape[0] - 1
-    for n in range(last + 1):
-        S[:] = D[n]
-        x[n] = g[n]
-        if n:
-            _take_through(U[n - 1], inverse[n - 1], through, x[n - 1], S, x[n])
-        if not _inverse(S, L, inverse[n]):
-            return False
-    rest = np.empty(6)
-    for n in range(last, -1, -1):
-        for r in range(6):
-            rest[r] = x[n, r]
-            if n < last:
-                for k in range(6):
-                    rest[r] -= U[n, r, k] * x[n + 1, k]
-        for r in range(6):
-            x[n, r] = 0.0
-            for k in range(6):
-                x[n, r] += inverse[n, r, k] * rest[k]
-    return True
-
-
-@kernel
-def chain_covariances(U: F64, inverse: F64, covariance: F64) -> None:
-    """Fill `covariance` (N, 6, 6) of each pose from what `solve_poses` leaves."""
-    last = inverse.shape[0] - 1
-    gain, half = np.empty((6, 6)), np.empty((6, 6))
-    covariance[last] = inverse[last]
-    for n in range(last - 1, -1, -1):
-        for r in range(6):
-            for c in range(6):
-                gain[r, c] = 0.0
-                for k in range(6):
-                    gain[r, c] += inverse[n, r, k] * U[n, k, c]
-        for r in range(6):
-            for c in range(6):
-                half[r, c] = 0.0
-                for k in range(6):
-                    half[r, c] += gain[r, k] * covariance[n + 1, k, c]
-        for r in range(6):
-            for c in range(6):
-                covariance[n, r, c] = inverse[n, r, c]
-                for k in range(6):
-                    covariance[n, r, c] += half[r, k] * gain[c, k]
-
-
 @kernel
 def leave_first(
     T: F64, measured: F64, information: F64, fix_m: F64, fix_information: F64, T_belief: F64, H_belief: F64,
@@ -248,10 +165,15 @@ def leave_first(
     D, U, g = np.empty((2, 6, 6)), np.empty((2, 6, 6)), np.empty((2, 6))
     L, inverse, through = np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     chain_equations(T, measured, information, fix_m, fix_information, T_belief, H_belief, g_belief, k2, D, U, g)
-    if not _inverse(D[0], L, inverse):
+    if not inverse_of(D[0], L, inverse):
         return False
+    through_pose(U[0], inverse, through)
     T_belief[:], H_belief[:], g_belief[:] = T[1], D[1], g[1]
-    _take_through(U[0], inverse, through, g[0], H_belief, g_belief)
+    for r in range(6):
+        for k in range(6):
+            g_belief[r] -= through[r, k] * g[0, k]
+            for c in range(6):
+                H_belief[r, c] -= through[r, k] * U[0, k, c]
     return True
 
 
@@ -276,13 +198,14 @@ def settle_chain(
     T, measured, information = T[gone:], measured[gone:], information[gone:]
     fix_m, fix_information, n = fix_m[gone:], fix_information[gone:], T.shape[0]
     D, U, g = np.empty((n, 6, 6)), np.empty((n, 6, 6)), np.empty((n, 6))
-    x, inverse = np.empty((n, 6)), np.empty((n, 6, 6))
+    inverse, beside = np.empty((n, 6, 6)), np.empty((n, 6, 6))
     for _ in range(most_steps):
         chain_equations(T, measured, information, fix_m, fix_information, T_belief, H_belief, g_belief, k2, D, U, g)
-        if not solve_poses(D, U, g, x, inverse):
+        if not factor_chain(D, U, inverse):
             return False
-        move(T, x.reshape(-1))
-        if np.abs(x[:, 3:]).max() < stop_m and np.abs(x[:, :3]).max() < stop_rad:
+        solve_chain_columns(U, inverse, g.reshape(n, 6, 1))
+        move(T, g.reshape(-1))
+        if np.abs(g[:, 3:]).max() < stop_m and np.abs(g[:, :3]).max() < stop_rad:
             break
-    chain_covariances(U, inverse, covariance)
+    chain_covariances(U, inverse, covariance, beside)
     return True

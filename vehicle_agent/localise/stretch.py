@@ -34,6 +34,7 @@ from gnd.vehicle_agent.localise.stretch_kernels import (
     SHARED,
     add_matches,
     add_steps,
+    covariances_asked,
     motions,
     residuals,
     settle_stretch,
@@ -274,9 +275,17 @@ def solve_stretch(
     ):  # fmt: skip
         raise np.linalg.LinAlgError(f"the normal equations of {len(knots)} scans and {len(steps)} steps are singular")
     held.give_back(knots)
-    covariance = np.asarray(np.linalg.inv(system.A), np.float64)
+    covariance = _covariance(system.A)
     seen = _as_seen(knots, belief, covariance, match_map, registration)
     return _solved(knots, measured, covariance, shared - belief.shared, belief.shared, registration, scales[-1], *seen)
+
+
+def _covariance(A: F64) -> F64:
+    """What is asked of the inverse of A (n, n), see `covariances_asked`."""
+    covariance = np.empty_like(A)
+    if covariances_asked(A, len(A) // 6 // 2, covariance):
+        return covariance
+    return np.asarray(np.linalg.inv(A), np.float64)
 
 
 def marginalised(

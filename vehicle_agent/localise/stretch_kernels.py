@@ -8,6 +8,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.jit import bare, kernel
+from gnd.vehicle_agent.localise.chain_kernels import chain_covariances, factor_chain, solve_chain_columns
 from gnd.vehicle_agent.localise.kernels import rotation_of
 from gnd.vehicle_agent.localise.register_kernels import linearise_pose
 
@@ -316,4 +317,88 @@ def settle_stretch(
                     shift = max(shift, abs(x[r]))
             if shift < stop_m and turn < stop_rad:
                 break
+    return True
+
+
+@bare
+def _inverted(S: F64, out: F64) -> bool:
+    """Fill `out` (n, n) with the inverse of S, symmetric, which is used up. False where it is not positive definite."""
+    n = S.shape[0]
+    for r in range(n):
+        for c in range(n):
+            out[r, c] = 1.0 if r == c else 0.0
+    for p in range(n):
+        if not S[p, p] > 0.0:
+            return False
+        pivot = S[p, p]
+        for c in range(n):
+            S[p, c] /= pivot
+            out[p, c] /= pivot
+        for r in range(n):
+            if r != p:
+                factor = S[r, p]
+                for c in range(n):
+                    S[r, c] -= factor * S[p, c]
+                    out[r, c] -= factor * out[p, c]
+    return True
+
+
+@kernel
+def covariances_asked(A: F64, middle: int, covariance: F64) -> bool:
+    """Fill what is asked of the inverse of the normal equations A (n, n), n = 6 N + `SHARED`: of each pose, of each with
+    its neighbours and with what all share, and all of the pose `middle`. The rest of `covariance` (n, n) is NaN.
+
+    False where A is not positive definite; nothing is filled then.
+    """
+    n = (A.shape[0] - SHARED) // 6
+    D, U, inverse = np.empty((n, 6, 6)), np.zeros((n, 6, 6)), np.empty((n, 6, 6))
+    X = np.zeros((n, 6, SHARED + 6))  # right sides: what all share, and the unit vectors of the middle
+    for k in range(n):
+        at = 6 * k
+        for r in range(6):
+            for c in range(6):
+                D[k, r, c] = A[at + r, at + c]
+                if k < n - 1:
+                    U[k, r, c] = A[at + r, at + c + 6]
+            for c in range(SHARED):
+                X[k, r, c] = A[at + r, 6 * n + c]
+    for r in range(6):
+        X[middle, r, SHARED + r] = 1.0
+    if not factor_chain(D, U, inverse):
+        return False
+    B = X[:, :, :SHARED].copy()
+    solve_chain_columns(U, inverse, X)
+    left = A[6 * n :, 6 * n :].copy()
+    for k in range(n):
+        for r in range(6):
+            for a in range(SHARED):
+                for b in range(SHARED):
+                    left[a, b] -= B[k, r, a] * X[k, r, b]
+    shared = np.empty((SHARED, SHARED))
+    if not _inverted(left, shared):
+        return False
+    own, beside = D, np.zeros((n, 6, 6))
+    chain_covariances(U, inverse, own, beside)
+    covariance[:] = np.nan
+    covariance[6 * n :, 6 * n :] = shared
+    with_shared = np.zeros((n, 6, SHARED))  # P^-1 B C
+    for k in range(n):
+        for r in range(6):
+            for a in range(SHARED):
+                for b in range(SHARED):
+                    with_shared[k, r, a] += X[k, r, b] * shared[b, a]
+                covariance[6 * k + r, 6 * n + a] = covariance[6 * n + a, 6 * k + r] = -with_shared[k, r, a]
+    for k in range(n):
+        for r in range(6):
+            for c in range(6):
+                here, next_one, far = own[k, r, c], beside[k, r, c], X[k, r, SHARED + c]
+                for a in range(SHARED):
+                    here += with_shared[k, r, a] * X[k, c, a]
+                    if k < n - 1:
+                        next_one += with_shared[k, r, a] * X[k + 1, c, a]
+                    far += with_shared[k, r, a] * X[middle, c, a]
+                covariance[6 * k + r, 6 * middle + c] = covariance[6 * middle + c, 6 * k + r] = far
+                covariance[6 * k + r, 6 * k + c] = here
+                if k < n - 1:
+                    covariance[6 * k + r, 6 * k + 6 + c] = covariance[6 * k + 6 + c, 6 * k + r] = next_one
     return True
