@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
 
-from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, HIT, NEXT_TO, _field, initialise
+from gnd.vehicle_agent.localise.initialise import (
+    AROUND_POSITION,
+    HIGHEST_GROUND_M,
+    HIT,
+    NEXT_TO,
+    _field,
+    ground_below,
+    initialise,
+)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -70,3 +78,25 @@ def test_the_field_that_is_scored_equals_its_plain_twin():
             plain[np.roll(occupied, side, axis)[1:-1, 1:-1, 1:-1]] = NEXT_TO
     plain[index >= 0] = HIT
     np.testing.assert_array_equal(_field(index), plain)
+
+
+def plain_ground_below(points_m):
+    near = points_m[np.hypot(points_m[:, 0], points_m[:, 1]) < 15.0, 2]
+    if not len(near):
+        return 0.0
+    low = near[near <= np.quantile(near, 0.6)]
+    counts, edges = np.histogram(low, bins=max(1, int(np.ptp(low) / 0.2)))
+    k = int(np.argmax(counts))
+    found = float(np.median(low[(low >= edges[k]) & (low <= edges[k + 1])]))
+    return found if found < HIGHEST_GROUND_M else 0.0
+
+
+def test_the_ground_below_equals_its_plain_twin():
+    rng = np.random.default_rng(0)
+    for turn in range(500):
+        points = rng.normal(0.0, [9.0, 9.0, 1.0], (int(rng.integers(0, 300)), 3))
+        if turn % 2:
+            points[:, 2] = np.round(points[:, 2], 1)  # many at one height, and on the edges between two
+        if turn % 3:
+            points[: len(points) // 2, 2] = -1.7
+        assert ground_below(points) == plain_ground_below(points)

@@ -204,14 +204,25 @@ def ground_below(points_m: F64) -> float:
     No vehicle stands below the ground: what would lie above the frame's origin is a wall or a car, seen by a sensor
     that looks ahead only, and the origin itself is on the road.
     """
-    near = points_m[np.hypot(points_m[:, 0], points_m[:, 1]) < 15.0, 2]
+    near = np.sort(points_m[np.hypot(points_m[:, 0], points_m[:, 1]) < 15.0, 2])  # once, for all that follows
     if not len(near):
         return 0.0
-    low = near[near <= np.quantile(near, 0.6)]
-    counts, edges = np.histogram(low, bins=max(1, int(np.ptp(low) / 0.2)))
-    k = int(np.argmax(counts))
-    found = float(np.median(low[(low >= edges[k]) & (low <= edges[k + 1])]))
+    low = near[: np.searchsorted(near, _quantile(near, 0.6), side="right")]
+    edges = np.linspace(low[0], low[-1], max(1, int((low[-1] - low[0]) / 0.2)) + 1)
+    begin = np.searchsorted(low, edges)
+    begin[-1] = len(low)
+    k = int(np.argmax(np.diff(begin)))
+    fullest = low[begin[k] : np.searchsorted(low, edges[k + 1], side="right")]
+    found = 0.5 * float(fullest[(len(fullest) - 1) // 2] + fullest[len(fullest) // 2])  # their median
     return found if found < HIGHEST_GROUND_M else 0.0
+
+
+def _quantile(rising: F64, share: float) -> float:
+    """As `numpy.quantile` of numbers (N,) that are sorted already."""
+    at = share * (len(rising) - 1)
+    low, high = float(rising[int(at)]), float(rising[min(int(at) + 1, len(rising) - 1)])
+    part = at - int(at)
+    return low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part)
 
 
 def _hypotheses(around: Around, ground: F64, ground_below_m: float, grid: SearchGrid) -> F64:
