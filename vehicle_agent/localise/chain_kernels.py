@@ -39,6 +39,15 @@ def through_pose(U: F64, inverse: F64, through: F64) -> None:
                 through[r, c] += U[k, r] * inverse[k, c]
 
 
+@bare
+def take_product(left: F64, right: F64, rest: F64) -> None:
+    """Take `left` (6, 6) times `right` (6, M) from `rest` (6, M)."""
+    for r in range(6):
+        for k in range(6):
+            for m in range(rest.shape[1]):
+                rest[r, m] -= left[r, k] * right[k, m]
+
+
 @kernel
 def factor_chain(D: F64, U: F64, inverse: F64) -> bool:
     """Eliminate from the first pose on: fill `inverse` (N, 6, 6) of what is left of each block of the diagonal. False
@@ -49,10 +58,7 @@ def factor_chain(D: F64, U: F64, inverse: F64) -> bool:
         S[:] = D[n]
         if n:
             through_pose(U[n - 1], inverse[n - 1], through)
-            for r in range(6):
-                for k in range(6):
-                    for c in range(6):
-                        S[r, c] -= through[r, k] * U[n - 1, k, c]
+            take_product(through, U[n - 1], S)
         if not inverse_of(S, L, inverse[n]):
             return False
     return True
@@ -63,24 +69,16 @@ def solve_chain_columns(U: F64, inverse: F64, X: F64) -> None:
     """Solve the equations that `factor_chain` has eliminated for M right sides X (N, 6, M), which the solutions
     replace.
     """
-    last, through, rest = X.shape[0] - 1, np.empty((6, 6)), np.empty(6)
+    last, through, rest = X.shape[0] - 1, np.empty((6, 6)), np.empty(X.shape[1:])
     for n in range(1, last + 1):
         through_pose(U[n - 1], inverse[n - 1], through)
-        for r in range(6):
-            for k in range(6):
-                for m in range(X.shape[2]):
-                    X[n, r, m] -= through[r, k] * X[n - 1, k, m]
+        take_product(through, X[n - 1], X[n])
     for n in range(last, -1, -1):
-        for m in range(X.shape[2]):
-            for r in range(6):
-                rest[r] = X[n, r, m]
-                if n < last:
-                    for k in range(6):
-                        rest[r] -= U[n, r, k] * X[n + 1, k, m]
-            for r in range(6):
-                X[n, r, m] = 0.0
-                for k in range(6):
-                    X[n, r, m] += inverse[n, r, k] * rest[k]
+        if n < last:
+            take_product(U[n], X[n + 1], X[n])
+        rest[:] = 0.0
+        take_product(inverse[n], X[n], rest)
+        X[n] = -rest
 
 
 @kernel
@@ -88,21 +86,16 @@ def chain_covariances(U: F64, inverse: F64, own: F64, beside: F64) -> None:
     """Fill `own` (N, 6, 6), the covariance of each pose, and `beside` (N, 6, 6), that of each with the next one (the
     last stays), from what `factor_chain` leaves.
     """
-    last, gain = inverse.shape[0] - 1, np.empty((6, 6))
+    last, gain, turned = inverse.shape[0] - 1, np.empty((6, 6)), np.empty((6, 6))
     own[last] = inverse[last]
     for n in range(last - 1, -1, -1):
+        gain[:] = 0.0
+        beside[n] = 0.0
+        take_product(inverse[n], U[n], gain)
         for r in range(6):
             for c in range(6):
-                gain[r, c] = 0.0
-                for k in range(6):
-                    gain[r, c] += inverse[n, r, k] * U[n, k, c]
-        for r in range(6):
-            for c in range(6):
-                beside[n, r, c] = 0.0
-                for k in range(6):
-                    beside[n, r, c] -= gain[r, k] * own[n + 1, k, c]
-        for r in range(6):
-            for c in range(6):
-                own[n, r, c] = inverse[n, r, c]
-                for k in range(6):
-                    own[n, r, c] -= beside[n, r, k] * gain[c, k]
+                gain[r, c] = -gain[r, c]
+                turned[c, r] = gain[r, c]
+        take_product(gain, own[n + 1], beside[n])
+        own[n] = inverse[n]
+        take_product(beside[n], turned, own[n])

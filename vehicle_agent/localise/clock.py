@@ -405,8 +405,8 @@ def _running_integral(t: F64, y: F64) -> F64:
 def integrals_at(
     t: F64, speed: F64, yaw_rate: F64, way: F64, turn: F64, at: F64, way_at: F64, turn_at: F64
 ) -> None:  # fmt: skip
-    """Fill `way_at` and `turn_at` (M,) with the integrals of straight lines through speed and yaw rate (N,) from t[0] to
-    the times `at` (M,), of which `way` and `turn` (N,) are those to t (N,). The ends are continued level.
+    """Fill `way_at` and `turn_at` (M,) with the integrals of straight lines through speed and yaw rate (N,), from t[0]
+    to the times `at` (M,), of which `way` and `turn` (N,) are those to t (N,). The ends are continued level.
     """
     last, k = t.shape[0] - 1, 0
     for m in range(at.shape[0]):

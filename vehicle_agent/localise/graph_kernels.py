@@ -14,6 +14,7 @@ from gnd.vehicle_agent.localise.chain_kernels import (
     factor_chain,
     inverse_of,
     solve_chain_columns,
+    take_product,
     through_pose,
 )
 from gnd.vehicle_agent.localise.stretch_kernels import motion, move
@@ -24,8 +25,8 @@ ODOMETRY, SCANS, MATCH = range(3)
 
 
 @bare
-def _add(J: F64, K: F64, weighted: F64, into: F64) -> None:
-    """Add J' W K (6, 6) to `into`; `weighted` (6, 6) is J' W."""
+def _add(weighted: F64, K: F64, into: F64) -> None:
+    """Add `weighted` K (6, 6) to `into`."""
     for r in range(6):
         for c in range(6):
             for k in range(6):
@@ -140,12 +141,12 @@ def chain_equations(
             _derivatives(R, R_off, p, Z, J_from, J_to)
             weight = _robust(e, W, 0.0 if kind == ODOMETRY else k2)
             _weigh(J_to, W, weight, weighted)
-            _add(J_to, J_to, weighted, D[n])
+            _add(weighted, J_to, D[n])
             _pull(weighted, e, g[n])
             if kind != MATCH:
                 _weigh(J_from, W, weight, weighted)
-                _add(J_from, J_from, weighted, D[n - 1])
-                _add(J_from, J_to, weighted, U[n - 1])
+                _add(weighted, J_from, D[n - 1])
+                _add(weighted, J_to, U[n - 1])
                 _pull(weighted, e, g[n - 1])
         if fix_information[n, 0] > 0.0:
             _add_fix(T[n], fix_m[n], fix_information[n], k2, D[n], g[n])
@@ -169,11 +170,8 @@ def leave_first(
         return False
     through_pose(U[0], inverse, through)
     T_belief[:], H_belief[:], g_belief[:] = T[1], D[1], g[1]
-    for r in range(6):
-        for k in range(6):
-            g_belief[r] -= through[r, k] * g[0, k]
-            for c in range(6):
-                H_belief[r, c] -= through[r, k] * U[0, k, c]
+    take_product(through, U[0], H_belief)
+    take_product(through, g[0].reshape(6, 1), g_belief.reshape(6, 1))
     return True
 
 

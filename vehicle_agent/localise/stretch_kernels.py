@@ -344,61 +344,78 @@ def _inverted(S: F64, out: F64) -> bool:
 
 
 @kernel
+def _taken_apart(A: F64, middle: int, D: F64, U: F64, X: F64) -> None:
+    """Fill blocks D and U (N, 6, 6) of the poses' part of A, and the right sides X (N, 6, `SHARED` + 6): how the poses
+    know what all share, and the unit vectors of the pose `middle`; X is 0 before.
+    """
+    n = D.shape[0]
+    for k in range(n):
+        at = 6 * k
+        D[k] = A[at : at + 6, at : at + 6]
+        if k < n - 1:
+            U[k] = A[at : at + 6, at + 6 : at + 12]
+        X[k, :, :SHARED] = A[at : at + 6, 6 * n :]
+    for r in range(6):
+        X[middle, r, SHARED + r] = 1.0
+
+
+@kernel
+def _covariance_of_shared(A: F64, B: F64, X: F64, shared: F64) -> bool:
+    """Fill `shared` (`SHARED`, `SHARED`), where X solves the poses' part of A for B (N, 6, `SHARED`). False where A is
+    not positive definite.
+    """
+    n = B.shape[0]
+    left = A[6 * n :, 6 * n :].copy()
+    for k in range(n):
+        for a in range(SHARED):
+            for b in range(SHARED):
+                for r in range(6):
+                    left[a, b] -= B[k, r, a] * X[k, r, b]
+    return _inverted(left, shared)
+
+
+@bare
+def _put(own: F64, through: F64, X: F64, covariance: F64, k: int, m: int) -> None:
+    """Put the covariance of the poses k and m into place, on both sides: `own` (6, 6) by the poses' part alone, and
+    what comes through all they share, `through` (6, `SHARED`) of k and X (6, `SHARED` or more) of m.
+    """
+    for r in range(6):
+        for c in range(6):
+            value = own[r, c]
+            for a in range(SHARED):
+                value += through[r, a] * X[c, a]
+            covariance[6 * k + r, 6 * m + c] = covariance[6 * m + c, 6 * k + r] = value
+
+
+@kernel
 def covariances_asked(A: F64, middle: int, covariance: F64) -> bool:
-    """Fill what is asked of the inverse of the normal equations A (n, n), n = 6 N + `SHARED`: of each pose, of each with
-    its neighbours and with what all share, and all of the pose `middle`. The rest of `covariance` (n, n) is NaN.
+    """Fill what is asked of the inverse of the normal equations A (n, n), n = 6 N + `SHARED`: of each pose, of each and
+    its neighbours, of each and what all share, and all of the pose `middle`. The rest of `covariance` (n, n) is NaN.
 
     False where A is not positive definite; nothing is filled then.
     """
     n = (A.shape[0] - SHARED) // 6
-    D, U, inverse = np.empty((n, 6, 6)), np.zeros((n, 6, 6)), np.empty((n, 6, 6))
-    X = np.zeros((n, 6, SHARED + 6))  # right sides: what all share, and the unit vectors of the middle
-    for k in range(n):
-        at = 6 * k
-        for r in range(6):
-            for c in range(6):
-                D[k, r, c] = A[at + r, at + c]
-                if k < n - 1:
-                    U[k, r, c] = A[at + r, at + c + 6]
-            for c in range(SHARED):
-                X[k, r, c] = A[at + r, 6 * n + c]
-    for r in range(6):
-        X[middle, r, SHARED + r] = 1.0
+    D, U, inverse, X = np.empty((n, 6, 6)), np.zeros((n, 6, 6)), np.empty((n, 6, 6)), np.zeros((n, 6, SHARED + 6))
+    _taken_apart(A, middle, D, U, X)
     if not factor_chain(D, U, inverse):
         return False
-    B = X[:, :, :SHARED].copy()
+    B, shared, through = X[:, :, :SHARED].copy(), np.empty((SHARED, SHARED)), np.zeros((n, 6, SHARED))
     solve_chain_columns(U, inverse, X)
-    left = A[6 * n :, 6 * n :].copy()
-    for k in range(n):
-        for r in range(6):
-            for a in range(SHARED):
-                for b in range(SHARED):
-                    left[a, b] -= B[k, r, a] * X[k, r, b]
-    shared = np.empty((SHARED, SHARED))
-    if not _inverted(left, shared):
+    if not _covariance_of_shared(A, B, X, shared):
         return False
     own, beside = D, np.zeros((n, 6, 6))
     chain_covariances(U, inverse, own, beside)
     covariance[:] = np.nan
     covariance[6 * n :, 6 * n :] = shared
-    with_shared = np.zeros((n, 6, SHARED))  # P^-1 B C
     for k in range(n):
         for r in range(6):
             for a in range(SHARED):
                 for b in range(SHARED):
-                    with_shared[k, r, a] += X[k, r, b] * shared[b, a]
-                covariance[6 * k + r, 6 * n + a] = covariance[6 * n + a, 6 * k + r] = -with_shared[k, r, a]
+                    through[k, r, a] += X[k, r, b] * shared[b, a]
+                covariance[6 * k + r, 6 * n + a] = covariance[6 * n + a, 6 * k + r] = -through[k, r, a]
     for k in range(n):
-        for r in range(6):
-            for c in range(6):
-                here, next_one, far = own[k, r, c], beside[k, r, c], X[k, r, SHARED + c]
-                for a in range(SHARED):
-                    here += with_shared[k, r, a] * X[k, c, a]
-                    if k < n - 1:
-                        next_one += with_shared[k, r, a] * X[k + 1, c, a]
-                    far += with_shared[k, r, a] * X[middle, c, a]
-                covariance[6 * k + r, 6 * middle + c] = covariance[6 * middle + c, 6 * k + r] = far
-                covariance[6 * k + r, 6 * k + c] = here
-                if k < n - 1:
-                    covariance[6 * k + r, 6 * k + 6 + c] = covariance[6 * k + 6 + c, 6 * k + r] = next_one
+        _put(X[k, :, SHARED:], through[k], X[middle], covariance, k, middle)
+        _put(own[k], through[k], X[k], covariance, k, k)
+    for k in range(n - 1):
+        _put(beside[k], through[k], X[k + 1], covariance, k, k + 1)
     return True
