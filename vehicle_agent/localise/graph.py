@@ -164,7 +164,8 @@ class PoseGraph:
         number = self.newest
         self._t_ns = {number: self._t_ns[number]}
         self._T, self._known = T_map_vehicle[None].copy(), _Known.of(None, None, None, None)
-        self._belief = _Belief(T_map_vehicle.copy(), np.linalg.inv(covariance), np.zeros(6))
+        information = np.asarray(np.linalg.inv(covariance), np.float64)
+        self._belief = _Belief(T_map_vehicle.copy(), information, np.zeros(6))
         self._settle()
 
     def _settle(self, gone: int = 0) -> None:
