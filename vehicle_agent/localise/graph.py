@@ -65,7 +65,7 @@ class SmoothedPose:
     axle_variance: float | None = None
 
 
-class _Known(NamedTuple):
+class _KnownPoses(NamedTuple):
     """What is measured of N poses in a row, as `chain_equations` takes it: `measured` (N, 3, 4, 4), `information`
     (N, 3, 6, 6), `fix_m` (N, 3), `fix_information` (N, 3).
     """
@@ -78,7 +78,7 @@ class _Known(NamedTuple):
     @classmethod
     def of(
         cls, odometry: OdometryEdge | None, scans: ScanStep | None, match: MapMatch | None, gnss: Position | None
-    ) -> "_Known":
+    ) -> "_KnownPoses":
         """Of one pose."""
         known = cls(np.zeros((1, 3, 4, 4)), np.zeros((1, 3, 6, 6)), np.zeros((1, 3)), np.zeros((1, 3)))
         if odometry is not None:
@@ -95,16 +95,16 @@ class _Known(NamedTuple):
             known.fix_m[0], known.fix_information[0] = gnss.p_map_m, 1.0 / sigma_m**2
         return known
 
-    def and_then(self, more: "_Known") -> "_Known":
+    def and_then(self, more: "_KnownPoses") -> "_KnownPoses":
         """These poses, and others behind them."""
-        return _Known(*(np.concatenate(both) for both in zip(self, more, strict=True)))
+        return _KnownPoses(*(np.concatenate(both) for both in zip(self, more, strict=True)))
 
-    def later(self, n: int) -> "_Known":
+    def later(self, n: int) -> "_KnownPoses":
         """Without the first n poses."""
-        return _Known(*(of[n:] for of in self))
+        return _KnownPoses(*(of[n:] for of in self))
 
 
-class _Belief(NamedTuple):
+class _PoseBelief(NamedTuple):
     """What is known of the first pose by all that has left the graph: information (6, 6) and gradient (6,) at a pose
     (4, 4).
     """
@@ -123,8 +123,8 @@ class PoseGraph:
     def __init__(self, parameters: GraphParameters) -> None:
         self.parameters = parameters
         self._T, self._covariance = np.empty((0, 4, 4)), np.empty((0, 6, 6))
-        self._known = _Known.of(None, None, None, None).later(1)
-        self._belief = _Belief(np.eye(4), np.zeros((6, 6)), np.zeros(6))
+        self._known = _KnownPoses.of(None, None, None, None).later(1)
+        self._belief = _PoseBelief(np.eye(4), np.zeros((6, 6)), np.zeros(6))
         self._t_ns: dict[int, int] = {}
         self._next = 0
 
@@ -152,7 +152,7 @@ class PoseGraph:
             LinAlgError: nothing ties the poses to the map.
         """
         final = self._leaving(t_ns)
-        self._known = self._known.and_then(_Known.of(odometry, scans, match, gnss))
+        self._known = self._known.and_then(_KnownPoses.of(odometry, scans, match, gnss))
         self._T = np.concatenate([self._T, T_start[None]])
         self._t_ns[self._next] = t_ns
         self._next += 1
@@ -163,9 +163,9 @@ class PoseGraph:
         """Forget everything but the newest pose, and hold that to be (4, 4) with covariance (6, 6)."""
         number = self.newest
         self._t_ns = {number: self._t_ns[number]}
-        self._T, self._known = T_map_vehicle[None].copy(), _Known.of(None, None, None, None)
+        self._T, self._known = T_map_vehicle[None].copy(), _KnownPoses.of(None, None, None, None)
         information = np.asarray(np.linalg.inv(covariance), np.float64)
-        self._belief = _Belief(T_map_vehicle.copy(), information, np.zeros(6))
+        self._belief = _PoseBelief(T_map_vehicle.copy(), information, np.zeros(6))
         self._settle()
 
     def _settle(self, gone: int = 0) -> None:
