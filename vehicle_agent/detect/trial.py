@@ -60,10 +60,9 @@ class _TrialScan:
         """The scan as it came."""
         return SegmentedScan(RefinedScan(self.t_ns, self.rays, self.estimate), self.moving)
 
-    def still(self, every: int = 1, centre_m: F64 | None = None) -> F32:
-        """(K, 3) every so many of the points that stand, from the centre of its rays or another one (3,)."""
-        off = np.zeros(3) if centre_m is None else self.rays.centre_m - centre_m
-        return _standing(self.rays.points_m, self.moving, every, off.astype(np.float32))
+    def still(self, points_m: F32) -> F32:
+        """(K, 3) those of its points (N, 3), from the centre of its rays, that stand."""
+        return _standing(points_m, self.moving, 1, np.zeros(3, np.float32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,10 +97,11 @@ class _Recent:
     X: F64
 
     @classmethod
-    def of(cls, scans: list[_TrialScan], X: F64) -> "_Recent":
+    def of(cls, scans: list[_TrialScan], some: list[F32], X: F64) -> "_Recent":
+        """Of a segment's scans, and some (K, 3) of what stands in each, from the centre of its rays."""
         centre = scans[0].rays.centre_m
-        still = [held.still(_EVERY_RECENT, centre) for held in scans]
-        return cls(centre, np.concatenate(still), X)
+        off = [(held.rays.centre_m - centre).astype(np.float32) for held in scans]
+        return cls(centre, np.concatenate([points + by for points, by in zip(some, off, strict=True)]), X)
 
 
 @dataclass(slots=True)
@@ -198,10 +198,17 @@ class Trial:
     def _try(self, scans: list[_TrialScan]) -> Tried:
         """Test against the base map, and where that finds a shift against what was seen just before."""
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
-        points = np.concatenate([some_of(held.still(), held.rays.centre_m, n) for held in scans])
+        sampled, recent, looked = [], [], np.empty((0, 3), np.float32)
+        for held in scans:
+            placed = held.rays.points_m  # once: to place the rays of a scan takes long
+            still = held.still(placed)
+            looked = looked_at(placed).copy() if held is scans[0] else looked
+            sampled.append(some_of(still, held.rays.centre_m, n))
+            recent.append(still[::_EVERY_RECENT].copy())
+        points = np.concatenate(sampled)
         T = scans[len(scans) // 2].estimate.T_map_vehicle
         points_m = transform(T_inverse(T), points)
-        seen = looked_at(scans[0].rays.points_m) @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
+        seen = looked @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
         shift = find_shift(points_m, T, self._map.near(T[:3, 3]), planar=not spreads(seen))
         poses = [PoseUncertainty.of(held.estimate) for held in scans]
         worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
@@ -210,7 +217,7 @@ class Trial:
         if far and self._sureness(points_m, T, shift) >= OF_SCANS.z:
             verdict = "shifted"
         if verdict == "good":
-            self._recent = _Recent.of(scans, T @ shift.T @ T_inverse(T))
+            self._recent = _Recent.of(scans, recent, T @ shift.T @ T_inverse(T))
         elif verdict == "shifted":
             self._recent = None
         return Tried(shift, verdict, points, T, len(scans), worst)
