@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.caps import CAP_OWNER_NAMES
+from gnd.cloud_merger.confirmation import seen_by
 from gnd.cloud_merger.hearing import Hearing, Said, Spoken, passing
-from gnd.cloud_merger.statements import Report, Statements, is_met
+from gnd.cloud_merger.statements import Report, Statements, find, is_met
 from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.tile_store.values import AgreementTest
@@ -26,6 +27,13 @@ JUDGED_VOXELS: Final = 12
 """Fewer statements that others can judge say nothing about a report."""
 REFUTED_CLAIMS: Final = 0.6
 """A report is refuted where others contradict this share of the changes that it claims, ..."""
+REFUTED_SEEN: Final = 0.15
+"""... and those are as much as this share of what it has seen there and they could judge: where nothing has changed all
+that an honest vehicle claims is wrong, at edges and in leaves, and is contradicted as surely as a lie, ..."""
+NEW_VOXELS: Final = 10
+REFUTED_NEW: Final = 0.8
+"""... or where they contradict this share of what it says has come, at least so many voxels, however little that is of
+what it has seen: an honest vehicle errs less about that than about what has gone or changed, ..."""
 REFUTED_QUOTES: Final = 0.8
 """... or where it says "as it was" of this share of what they have clearly found changed before it came."""
 DENIED_CLAIM: Final = 2
@@ -105,10 +113,11 @@ def agreement_of(
     changed = (told.said != Said.OPEN) & (before >= DENIED_QUOTE) & (before > still + 1)
     quoted = same & (before + still >= DENIED_QUOTE)
     voxel_id, tests = statements.rows["voxel_id"][told.at], []
+    seen = _seen_again(reports, epoch)
     for number, report in enumerate(reports):
         own = told.report == number
         of_it = _Statements(own & judged, own & refuted, own & quoted, own & changed, claim)
-        tests.append(_test_of(reports, report, voxel_id, of_it, epoch))
+        tests.append(_test_of(reports, report, voxel_id, of_it, epoch, seen[number]))
     contradicted = _contradicted(reports, n_judged, n_denied)
     denied = _by_vehicle(reports, n_judged + n_settled, n_denied)
     return Agreement(tuple(one for one in tests if one is not None), contradicted, denied)
@@ -136,6 +145,35 @@ def _voices_around(told: Spoken, which: Mask) -> tuple[I64, I64]:
         before += np.where(own, own_before, np.minimum(own_before, CAP_OWNER_NAMES))
         after += np.where(own, own_after, np.minimum(own_after, CAP_OWNER_NAMES))
     return before, after
+
+
+def _seen_again(reports: Sequence[Report], epoch: Gaussians) -> list[int]:
+    """Of each report how many voxels of the tile before the window it has seen that so many others have seen later,
+    too, that they could contradict it.
+    """
+    number = {name: k for k, name in enumerate(dict.fromkeys(_name_of(one) for one in reports))}
+    last_ns = np.full((len(number), len(epoch)), np.iinfo(np.int64).min)
+    found = [find(epoch.voxel_id, seen_by(one.change, epoch)) for one in reports]
+    rows = [at[at >= 0] for at in found]
+    for one, at in zip(reports, rows, strict=True):
+        own = last_ns[number[_name_of(one)]]
+        own[at] = np.maximum(own[at], one.last_ns)
+    n_again = []
+    for one, at in zip(reports, rows, strict=True):
+        later = last_ns[:, at] > one.last_ns
+        others = later.sum(axis=0) - later[number[_name_of(one)]]
+        n_again.append(int((others >= DENIED_CLAIM).sum()))
+    return n_again
+
+
+def _name_of(report: Report) -> str:
+    """Of its vehicle; of a report without one its own."""
+    return report.vehicle or report.report_id
+
+
+def is_denied(test: AgreementTest) -> bool:
+    """Whether most of what a report claims is contradicted, however little that is of what it has seen."""
+    return test.claims >= JUDGED_VOXELS and test.refuted_claims >= REFUTED_CLAIMS * test.claims
 
 
 def _around(seat: I64, which: Mask) -> tuple[I64, I64]:
@@ -171,17 +209,27 @@ def _contradicted(reports: Sequence[Report], n_judged: I64, n_denied: I64) -> fr
 
 
 def _test_of(
-    reports: Sequence[Report], report: Report, voxel_id: NDArray[np.int32], own: _Statements, epoch: Gaussians
+    reports: Sequence[Report],
+    report: Report,
+    voxel_id: NDArray[np.int32],
+    own: _Statements,
+    epoch: Gaussians,
+    seen_again: int,
 ) -> AgreementTest | None:
     claims, wrong_claims = int(own.claims.sum()), int(own.refuted.sum())
     changed, missed = int(own.changed.sum()), int((own.changed & ~own.claim).sum())
     if max(claims, changed, int(own.quotes.sum())) < JUDGED_VOXELS:
         return None  # else there is a test, whatever it says: those who come later may clear whom the first made wrong
+    is_new = ~are_in(voxel_id, epoch.voxel_id)
+    seen = seen_again + int((own.claims & is_new).sum())
     by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
     if by_claims:  # what parks and leaves that come differ from drive to drive, and are nobody's fault
         lasting = ~are_in(voxel_id, passing(report, epoch))
         claims, wrong_claims = int((own.claims & lasting).sum()), int((own.refuted & lasting).sum())
-        by_claims = claims >= JUDGED_VOXELS and wrong_claims >= REFUTED_CLAIMS * claims
+        come = lasting & is_new
+        n_come, wrong_come = int((own.claims & come).sum()), int((own.refuted & come).sum())
+        by_claims = claims >= JUDGED_VOXELS and wrong_claims >= max(REFUTED_CLAIMS * claims, REFUTED_SEEN * seen)
+        by_claims |= n_come >= NEW_VOXELS and wrong_come >= REFUTED_NEW * n_come
     by_quotes = changed >= JUDGED_VOXELS and missed >= REFUTED_QUOTES * changed
     if by_quotes:  # what had parked may have gone again
         parked = [passing(one, epoch) for one in reports if one is not report]
@@ -197,4 +245,5 @@ def _test_of(
         quotes=changed,
         refuted_quotes=missed,
         is_refuted=by_claims or by_quotes,
+        seen=seen,
     )

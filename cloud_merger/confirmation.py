@@ -68,7 +68,8 @@ class ConfirmationParameters:
     )
     copies: bool = setting(
         True,
-        "Whether vehicles that send the same measurements to the bit, which two drives never give, are one witness.",
+        "Whether vehicles that send the same measurements to the bit, which two drives never give, or the same false "
+        "claims, are one witness. Not where drives are replayed for several vehicles.",
     )
     parked_h: float = setting(
         18.0,
@@ -279,7 +280,7 @@ def _waiting_of(
 
 def seen_of(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
     """Voxels of the tile that a vehicle observed and that hold something, before or by its word."""
-    own = [_seen_by(report.change, epoch) for report in reports if report.vehicle == vehicle]
+    own = [seen_by(report.change, epoch) for report in reports if report.vehicle == vehicle]
     if not own:
         return 0  # it spoke in an earlier window
     return len(own[0]) if len(own) == 1 else len(unique(np.concatenate(own)))
@@ -288,8 +289,10 @@ def seen_of(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
 _SEEN: Final[ByObject[tuple[Gaussians, I32]]] = ByObject(REMEMBERED)
 
 
-def _seen_by(change: TileChange, epoch: Gaussians) -> I32:
-    """The same of one report, sorted ids; found once for each epoch, which is held so that no other gets its id."""
+def seen_by(change: TileChange, epoch: Gaussians) -> I32:
+    """Sorted ids of the voxels of the tile `epoch` that a report observed and that hold something, before or by its
+    word. Found once for each epoch, which is held so that no other gets its id.
+    """
 
     def made() -> tuple[Gaussians, I32]:
         before = change.observed[are_in(change.observed, epoch.voxel_id)]

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.cloud_merger.agreement import is_denied
 from gnd.cloud_merger.caps import Owners
 from gnd.cloud_merger.statements import REMEMBERED, Kind, Report, Rows, Statements, Witness
 from gnd.gnd_map.by_object import ByObject
@@ -70,7 +71,7 @@ def groups_of(store: Store) -> list[VehicleGroup]:
 
 def coincidences_of(reports: Iterable[Report], tests: Iterable[AgreementTest]) -> tuple[Coincidence, ...]:
     """How far the claims of the vehicles that are refuted in a window coincide, two by two."""
-    refuted = {test.report_id for test in tests if test.is_refuted}
+    refuted = {test.report_id for test in tests if test.is_refuted or is_denied(test)}
     told: dict[str, TileChange] = {}
     for report in sorted(reports, key=lambda one: one.turn):
         if report.report_id in refuted and report.vehicle:

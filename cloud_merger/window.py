@@ -165,7 +165,7 @@ class WindowMerger:
         if not rules.together:
             reports, state = without_unsure(reports), TileState(state.gaussians, state.memory.without_met())
         unheard: tuple[str, ...] = ()
-        copies: tuple[Coincidence, ...] = ()
+        alike: tuple[Coincidence, ...] = ()
         out, named = marked.counted_out, marked.shifted
         if rules.has_paper_rules:  # they know neither shift tests nor a gate nor a memory
             in_play = Believed(tuple(reports), (), ())
@@ -175,8 +175,9 @@ class WindowMerger:
             shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
             in_play = believed(reports, shifts, named)
             told = self._told(state, in_play)
-            copies = copies_of(reports, told.uncapped) if self.confirmation.copies else ()
             agreement = agreement_of(state.gaussians, told.statements, told.spoken, told.heard, self.judges_met)
+            if self.confirmation.copies:
+                alike = joined([*coincidences_of(reports, agreement.tests), *copies_of(reports, told.uncapped)])
             is_less = bool(out & {one.vehicle for one in in_play.reports})
             if is_less or self._is_of_groups(state, in_play.reports, marked):
                 in_play = in_play.without(out)
@@ -200,7 +201,7 @@ class WindowMerger:
         gaussians = self._on_lattice(gated.merged, reports, lattice)
         return MergedWindow(
             tuple(reports), in_play, statements, gated, gaussians, parked, self.bases, agreement.tests,
-            self.has_hearing, agreement.denied, joined([*coincidences_of(reports, agreement.tests), *copies]), unheard,
+            self.has_hearing, agreement.denied, alike, unheard,
         )  # fmt: skip
 
     def _is_of_groups(self, state: TileState, reports: Sequence[Report], marked: Marked) -> bool:

@@ -37,6 +37,7 @@ STEPS: Final = (
     (18, "schema_of_districts"),
     (19, "schema_of_catalogs"),
     (20, "schema_of_lists"),
+    (21, "schema_of_seen"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 _TRIGGERS: Final = ("survey_goes", "quarantine_grows", "quarantine_shrinks", "copy_notes_", "moved_away_",

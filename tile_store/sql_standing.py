@@ -4,12 +4,12 @@ All of it is counted from what the merges of tiles say, and those do not look at
 the reports, in whatever order their tiles are merged.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.connection import SqlConnection, change, fetch, post
-from gnd.tile_store.marks import contradicted, grouped, over_cap
+from gnd.tile_store.marks import Marked, contradicted, grouped, over_cap
 from gnd.tile_store.sql_accounts import NEWEST_TESTS
 from gnd.tile_store.sql_inbox import merge_again
 from gnd.tile_store.values import Coincidence, LoneWord, VehiclePair, VehicleStanding
@@ -44,7 +44,7 @@ def put_standings(
     timing: Mapping[str, Any],
 ) -> None:
     """Enter how vehicles stand in windows of a tile, all of those of which there is anything to tell. Where that
-    changes who is believed alone, the tiles in whose open windows it has spoken are merged again.
+    changes who is believed alone, the tiles in whose open windows it claims something alone are merged again.
     """
     place = {"layer": layer, "tile": tile.morton}
     rows = fetch(c, "standings_of_tile", place | {"first": min(windows)})
@@ -116,7 +116,8 @@ def _judge(c: SqlConnection, vehicle: str, timing: Mapping[str, Any]) -> None:
 def _believe_alone(c: SqlConnection, vehicle: str, day: int, why: str, timing: Mapping[str, Any]) -> None:
     """Let what a vehicle alone claims wait, on a day or in general, for that reason; "": let it not."""
     if _note(c, vehicle, day, why, timing):
-        _merge_open_tiles_again(c, vehicle, timing)
+        for layer, tile in fetch(c, "tiles_claimed_alone", {"vehicle": vehicle}):  # no other asks for the word
+            merge_again(c, layer, TileId(tile), dict(timing))
 
 
 def _note(c: SqlConnection, who: str, day: int, why: str, timing: Mapping[str, Any]) -> bool:
@@ -128,6 +129,26 @@ def _note(c: SqlConnection, who: str, day: int, why: str, timing: Mapping[str, A
     elif known and not why:
         post(c, "delete_lone_word", told)
     return bool(known) != bool(why)
+
+
+def merge_by_words_of_now(
+    c: SqlConnection,
+    layer: str,
+    tile: TileId,
+    named: Iterable[str],
+    alone: Collection[str],
+    timing: Mapping[str, Any],
+) -> None:
+    """Merge a tile again whose newest merge, by the words `named`, knew other words about the vehicles `alone`, which
+    claim something alone there, than there are now: one that comes while a tile is merged does not know yet who will.
+    """
+    if not alone:
+        return
+    marked = Marked.of(named)
+    before = marked.over_cap | {(vehicle, IN_GENERAL) for vehicle in marked.contradicted}
+    now = {(vehicle, day) for vehicle, day in fetch(c, "lone_words_of_tile", {"layer": layer, "tile": tile.morton})}
+    if any(vehicle in alone for vehicle, _ in before ^ now):
+        merge_again(c, layer, tile, dict(timing))
 
 
 def _merge_open_tiles_again(c: SqlConnection, vehicle: str, timing: Mapping[str, Any]) -> None:

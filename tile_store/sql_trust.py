@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterable
+from dataclasses import replace
 from hashlib import sha256
 from threading import Lock
 from typing import Any, Final
@@ -14,6 +15,7 @@ from gnd.tile_store.sql_accounts import NEWEST_TESTS, ids_of
 from gnd.tile_store.sql_inbox import merge_again
 from gnd.tile_store.values import QUARANTINED, AgreementTest, Basis, VehicleTrust, counted_out
 
+_COUNTS: Final = ("claims", "refuted_claims", "quotes", "refuted_quotes", "refuted", "seen")
 REFUTED_SHOWN: Final = 4096
 REMEMBERED_OWNERS: Final = 65_536
 REFUTED_TILES: Final = 3
@@ -21,7 +23,10 @@ REFUTED_TILES: Final = 3
 REFUTED_SHARE: Final = 0.5
 """... if they are so many of all in which they could, ..."""
 REFUTED_STATEMENTS: Final = 0.4
-"""... or if they have contradicted so many of all its statements: where two of three lie, no tile says it clearly."""
+"""... or if they have contradicted so many of all its statements: where two of three lie, no tile says it clearly; and
+of its claims as much as ..."""
+REFUTED_SEEN: Final = 0.1
+"""... this share of what it has seen there, unless what it says is as it was is contradicted as often."""
 
 
 def put_tests(
@@ -44,7 +49,7 @@ def put_tests(
     for test in made:
         told = {name: getattr(test, name) for name in AgreementTest.__slots__ if name != "is_refuted"}
         told["refuted"] = int(test.is_refuted)
-        now = tuple(told[name] for name in ("claims", "refuted_claims", "quotes", "refuted_quotes", "refuted"))
+        now = tuple(told[name] for name in _COUNTS)
         if before.get(test.report_id) == now:
             continue  # a tile's tests come with each of its merges
         post(c, "put_agreement_test", told | place)
@@ -52,17 +57,24 @@ def put_tests(
     known = {one.vehicle: one for one in quarantined(c)} if vehicles else {}
     for vehicle in sorted(vehicles):
         found = trust_of(c, vehicle)
-        said, wrong = found.claims + found.quotes, found.refuted_claims + found.refuted_quotes
-        is_bad = found.refuted >= REFUTED_TILES and (
-            found.refuted >= REFUTED_SHARE * found.tested or wrong >= REFUTED_STATEMENTS * said
-        )
-        if is_bad and vehicle not in known:
+        is_wrong = is_bad(found)
+        if is_wrong and vehicle not in known:
+            said, wrong = found.claims + found.quotes, found.refuted_claims + found.refuted_quotes
             why = f"others contradict it in {found.refuted} of {found.tested} tiles, {wrong} of {said} statements"
             told = {"vehicle": vehicle, "since_ns": timing["now"], "source": "agreement", "why": why}
             change(c, "quarantine_vehicle", told)
             _merge_its_tiles_again(c, vehicle, timing)
-        elif vehicle in known and is_news and not is_bad and _let_out(c, vehicle):
+        elif vehicle in known and is_news and not is_wrong and _let_out(c, vehicle):
             _merge_its_tiles_again(c, vehicle, timing)
+
+
+def is_bad(found: VehicleTrust) -> bool:
+    """Whether a vehicle's word counts no more, by what its tests say."""
+    if found.refuted < REFUTED_TILES:
+        return False
+    said, wrong = found.claims + found.quotes, found.refuted_claims + found.refuted_quotes
+    is_much = found.refuted_claims >= REFUTED_SEEN * found.seen or found.refuted_quotes >= found.refuted_claims
+    return found.refuted >= REFUTED_SHARE * found.tested or (is_much and wrong >= REFUTED_STATEMENTS * said)
 
 
 def _let_out(c: SqlConnection, vehicle: str) -> bool:
@@ -90,22 +102,11 @@ def trust_of(c: SqlConnection, vehicle: str) -> VehicleTrust:
     rows = fetch(c, "agreement_tests_of_vehicle", {"vehicle": vehicle, "n": NEWEST_TESTS})
     claims, wrong_claims, quotes, wrong_quotes = (sum(row[column] for row in rows) for column in range(1, 5))
     state = next((one for one in quarantined(c) if one.vehicle == vehicle), None)
-    refuted = sum(1 for row in rows if row[5])
-    if state is None:
-        return VehicleTrust(vehicle, len(rows), refuted, claims, wrong_claims, quotes, wrong_quotes, False)
-    return VehicleTrust(
-        vehicle,
-        len(rows),
-        refuted,
-        claims,
-        wrong_claims,
-        quotes,
-        wrong_quotes,
-        True,
-        state.by,
-        state.why,
-        state.since_ns,
+    refuted, seen = sum(1 for row in rows if row[5]), sum(row[6] for row in rows)
+    found = VehicleTrust(
+        vehicle, len(rows), refuted, claims, wrong_claims, quotes, wrong_quotes, state is not None, seen=seen
     )
+    return found if state is None else replace(found, by=state.by, why=state.why, since_ns=state.since_ns)
 
 
 def trusts(c: SqlConnection) -> list[VehicleTrust]:

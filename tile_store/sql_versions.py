@@ -111,6 +111,9 @@ def _put_tests(c: SqlConnection, publication: Publication, timing: dict[str, Any
     if publication.basis is not None and not is_feature_layer(claim.layer):
         windows = (*publication.closed, publication.basis.window)
         standing.put_standings(c, claim.layer, claim.tile, windows, publication.standings, timing)
+        alone = {one.vehicle for one in publication.standings if one.alone}
+        alone |= {one.vehicle for one in publication.waiting or ()}
+        standing.merge_by_words_of_now(c, claim.layer, claim.tile, publication.basis.named, alone, timing)
     judged = [test.vehicle for test in publication.agreement_tests]
     standing.put_coincidences(c, claim.layer, claim.tile, publication.coincidences, judged, timing)
     refuted.merge_again(c, claim.layer, before, refuted.refuted(c, claim.layer, vehicles), timing)

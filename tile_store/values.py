@@ -533,6 +533,7 @@ class AgreementTest:
         quotes: voxels that are as they were, by its word, and that others can judge, ...
         refuted_quotes: ... of which so many have changed by theirs.
         is_refuted: it is contradicted as a whole.
+        seen: voxels of the tile that hold something, before or by its word, and that it has seen; 0: not known.
     """
 
     report_id: str
@@ -543,6 +544,7 @@ class AgreementTest:
     quotes: int
     refuted_quotes: int
     is_refuted: bool
+    seen: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -658,6 +660,7 @@ class VehicleTrust:
         by: "agreement" or "operator"; "": it is not quarantined.
         why: reason in a line.
         since_ns: when it was quarantined, UTC; 0: it is not.
+        seen: voxels of those tiles that hold something and that it has seen; 0: not known.
     """
 
     vehicle: str
@@ -671,6 +674,7 @@ class VehicleTrust:
     by: str = ""
     why: str = ""
     since_ns: int = 0
+    seen: int = 0
 
 
 @dataclass(frozen=True, slots=True)

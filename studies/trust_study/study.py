@@ -1,7 +1,7 @@
 """`gnd reproduce trust`: a fleet in which some are bad; what becomes of the map, and who is named for it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any, Final
 
@@ -31,7 +31,9 @@ _JUDGED: Final = tuple(f"honest_{name}" for name in ("quarantined", "shifted", "
 _HONEST: Final = {
     "honest vehicles": "{honest}",
     "F1": "{f1:.1f}",
+    "map changed": "{changed_share:.1%}",
     "quarantined": "{honest_quarantined}",
+    "... at some time": "{ever_quarantined}",
     "shifted": "{honest_shifted}",
     "not believed alone": "{honest_unbelieved}",
     "in groups": "{honest_grouped}",
@@ -63,6 +65,7 @@ class TrustOptions:
     street: Any = street_option(120.0)
     apart_min: float = option(3.0, "Minutes between the starts of two vehicles.", "--apart", span=(0, 1e5))
     parking: float | None = option(None, "Share of parking slots that are taken.", span=(0, 1))
+    edits: float = option(1.0, "Share of the street's edits made; 0: nothing has changed.", span=(0, 1))
     method: MethodParameters = parts(method_of, changes=SET)
 
     def __post_init__(self) -> None:
@@ -72,7 +75,7 @@ class TrustOptions:
         """The simulation that makes the honest reports."""
         return RunOptions(
             seeds=self.seeds,
-            street=self.street,
+            street=replace(self.street, edit_share=self.edits),
             vehicles=(self.vehicles,),
             apart_min=self.apart_min,
             parking=self.parking,
@@ -117,7 +120,9 @@ def run_kind(
     if kind == "honest":
         run = run_cloud(scorer.base, honest, merge)
         names = {one.vehicle for reports in honest for one in reports}
-        return run.judgements(names) | {"f1": scorer.score(run.tiles).f1(), "honest": len(honest), "alone": run.alone}
+        told = {"f1": scorer.score(run.tiles).f1(), "honest": len(honest), "alone": run.alone}
+        told |= {"ever_quarantined": len(run.named_after), "changed_share": changed_share(scorer.base.tiles, run.tiles)}
+        return run.judgements(names) | told
     bad = bad_ones(len(honest), kind, share, seed)
     fleet, lies = list[Sequence[ChangeReport]](), list[list[ChangeReport]]()
     for number, reports in enumerate(honest):
@@ -186,6 +191,16 @@ def false_published(
     return claims, published
 
 
+def changed_share(base: Mapping[TileId, Gaussians], tiles: Mapping[TileId, Gaussians]) -> float:
+    """Of the voxels that the map held before or holds after a fleet those that it has changed."""
+    changed, n = 0, 0
+    for tile in base.keys() | tiles.keys():
+        was, now = (one.get(tile, Gaussians.empty()) for one in (base, tiles))
+        ids = np.union1d(was.voxel_id, now.voxel_id)
+        changed, n = changed + int((~_same(was, now, ids)).sum()), n + len(ids)
+    return changed / max(n, 1)
+
+
 def _same(a: Gaussians, b: Gaussians, ids: Any) -> Any:
     """Whether two states of a tile hold the same at some voxels."""
     there_a, there_b = are_in(ids, a.voxel_id), are_in(ids, b.voxel_id)
@@ -201,7 +216,8 @@ def _mean_of(worlds: Sequence[Mapping[str, Any]], kinds: Sequence[str]) -> dict[
     found: dict[str, Any] = {
         "honest": {
             "f1": float(np.mean([one["honest"]["f1"] for one in worlds])),
-            **{name: sum(one["honest"][name] for one in worlds) for name in ("honest", *_JUDGED)},
+            **{name: sum(one["honest"][name] for one in worlds) for name in ("honest", "ever_quarantined", *_JUDGED)},
+            "changed_share": float(np.mean([one["honest"]["changed_share"] for one in worlds])),
             "alone": max(one["honest"]["alone"] for one in worlds),
         }
     }

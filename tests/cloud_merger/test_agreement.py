@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 from merger_world import BALL, GROUND, WALL, change_of, gaussians_of, report_of, seen_by
 
+from gnd.cloud_merger import agreement
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import rows_of
 from gnd.cloud_merger.merge import MergeParameters
@@ -20,8 +21,9 @@ from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile, content_sha
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport
+from gnd.tile_store import sql_trust
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.values import QUARANTINED, StoreConfig
+from gnd.tile_store.values import QUARANTINED, StoreConfig, VehicleTrust
 
 FIRST = 497353963154
 TILES = [TileId(FIRST + number) for number in range(4)]
@@ -131,6 +133,49 @@ def test_who_invents_is_named(store: SqliteStore) -> None:
     take(store, [*says(2, "a", NOTHING), *says(3, "b", NOTHING), *says(1, "bad", BUILT)])
     assert store.quarantined_vehicles() == {"bad"}
     assert shas(store) == UNTOUCHED
+
+
+@pytest.mark.parametrize("is_counted", [True, False])
+def test_who_errs_about_little_of_what_it_sees_is_not_named(
+    store: SqliteStore, monkeypatch: pytest.MonkeyPatch, is_counted: bool
+) -> None:
+    """Where nothing has changed all that an honest vehicle claims is wrong: a tenth of each tile here, edges say."""
+    if not is_counted:
+        monkeypatch.setattr(agreement, "REFUTED_SEEN", 0.0)
+        monkeypatch.setattr(sql_trust, "REFUTED_SEEN", 0.0)
+    edges = {tile: dict.fromkeys(wall_of(tile)[:14], None) for tile in TILES}
+    take(store, [*says(1, "rough", edges), *(one for n, name in enumerate("abc", 2) for one in says(n, name, NOTHING))])
+    (rough,) = [one for one in store.vehicle_trusts() if one.vehicle == "rough"]
+    assert (rough.tested, rough.claims, rough.refuted_claims, rough.seen) == (4, 56, 56, 4 * len(base_of(TILES[0])))
+    assert rough.refuted == (0 if is_counted else 4)
+    assert store.quarantined_vehicles() == (frozenset() if is_counted else {"rough"})
+    assert shas(store) == UNTOUCHED
+
+
+def test_who_invents_little_but_everywhere_is_named(store: SqliteStore) -> None:
+    """As little as the edges of the other one: but nothing that others see makes it look as if something had come."""
+    some = {tile: dict.fromkeys(new_of(tile)[:14], BALL) for tile in TILES}
+    take(store, [*says(1, "bad", some), *(one for n, name in enumerate("abc", 2) for one in says(n, name, NOTHING))])
+    assert store.quarantined_vehicles() == {"bad"}
+    assert shas(store) == UNTOUCHED
+
+
+@pytest.mark.parametrize(
+    ("refuted", "claims", "wrong", "quotes", "missed", "seen", "bad"),
+    [
+        (3, 42, 42, 0, 0, 500, False),  # all that it claims is wrong, and that is little of what it has seen
+        (3, 42, 42, 0, 0, 400, True),
+        (2, 42, 42, 0, 0, 400, False),
+        (3, 100, 42, 60, 20, 400, False),  # most of its statements hold
+        (4, 42, 42, 0, 0, 5000, True),  # in half of its tiles
+        (3, 0, 0, 42, 42, 5000, True),  # it never sees what has changed
+        (3, 42, 42, 0, 0, 0, True),  # by a release that did not note what was seen
+    ],
+)
+def test_who_is_wrong_in_few_tiles_of_many_is_out_if_it_is_much(
+    refuted: int, claims: int, wrong: int, quotes: int, missed: int, seen: int, bad: bool
+) -> None:
+    assert sql_trust.is_bad(VehicleTrust("v", 8, refuted, claims, wrong, quotes, missed, False, seen=seen)) == bad
 
 
 def test_who_says_that_nothing_has_changed_is_named_by_three(store: SqliteStore) -> None:

@@ -12,7 +12,9 @@ from test_agreement import BUILT, GONE, NS, TILES, at, base_of, new_of, observed
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.erase import erase_vehicle
+from gnd.cloud_merger.expander import rows_of
 from gnd.cloud_merger.verify import Verifier
+from gnd.cloud_merger.work import Worker
 from gnd.deploy.cli import gnd
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
@@ -87,6 +89,41 @@ def test_who_is_contradicted_elsewhere_is_not_believed_alone(store: SqliteStore)
     assert "not believed alone: others deny 96 of 96" in said_of(store, "bad")
     take(store, of(3, "second", {LAST: little(LAST)}))
     assert changed(store, LAST) == 8
+    assert is_verified(store)
+
+
+def journal_of(store: SqliteStore, tile: TileId) -> int:
+    """How many numbers its journal has given, to reports and to marks that it is to be merged again."""
+    ((given,),) = store.look(lambda c: list(c.execute("SELECT seq FROM journal WHERE tile = ?", (tile.morton,))))  # type: ignore[attr-defined]
+    return int(given)
+
+
+def test_only_where_a_vehicle_claims_something_alone_its_word_is_asked_for(store: SqliteStore) -> None:
+    """A tile about which it says what others say, too, is not merged again."""
+    take(store, [*lies(), *of(4, "bad", {TILES[2]: {}})])
+    before = {tile: journal_of(store, tile) for tile in TILES}
+    take(store, of(2, "honest", {TILES[0]: {}, TILES[1]: {}}))
+    assert [one.vehicle for one in store.lone_words()] == ["bad"]
+    assert journal_of(store, LAST) > before[LAST]
+    assert journal_of(store, TILES[2]) == before[TILES[2]]
+
+
+def test_a_word_that_comes_while_a_tile_is_merged_counts_there(store: SqliteStore) -> None:
+    """The merge was begun when nobody had contradicted the vehicle, and nothing was known yet of its claims there."""
+    *elsewhere, here = lies()
+    take(store, elsewhere)
+    store.put_reports(rows_of(here, NS))
+    worker = Worker(store, ShardConfig("slow", store.path))
+    claims = store.claim("slow", 16, 60.0)
+    assert [one.tile for one in claims] == [LAST]
+    worker.begin(claims)
+    publications = worker.merge(claims)
+    take(store, of(2, "honest", {TILES[0]: {}, TILES[1]: {}}))
+    assert [one.vehicle for one in store.lone_words()] == ["bad"]
+    store.publish(publications)
+    assert changed(store, LAST) == 8
+    take(store, [])
+    assert changed(store, LAST) == 0
     assert is_verified(store)
 
 

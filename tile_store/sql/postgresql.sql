@@ -548,6 +548,10 @@ CREATE TABLE district_list (
   signature bytea  NOT NULL CHECK (length(signature) = 64)
 );
 
+-- name: schema_of_seen
+-- Step 21, likewise.
+ALTER TABLE agreement_test ADD COLUMN seen bigint NOT NULL DEFAULT 0 CHECK (seen >= 0);
+
 -- name: store_lock
 SELECT store_lock(:store::integer, :alone <> 0, :parts::bigint[]::integer[])
 
@@ -667,12 +671,12 @@ SELECT report_id FROM course_said
 WHERE layer = :layer AND tile = :tile AND report_id IN (SELECT json_array_elements_text(:ids::json))
 
 -- name: agreement_tests_of_tile
-SELECT report_id, claims, refuted_claims, quotes, refuted_quotes, refuted FROM agreement_test
+SELECT report_id, claims, refuted_claims, quotes, refuted_quotes, refuted, seen FROM agreement_test
 WHERE layer = :layer AND tile = :tile AND report_id IN (SELECT json_array_elements_text(:ids::json))
 
 -- name: agreement_tests_of_vehicle
-SELECT at_ns, claims, refuted_claims, quotes, refuted_quotes, refuted FROM (
-  SELECT DISTINCT ON (layer, tile) layer, tile, at_ns, claims, refuted_claims, quotes, refuted_quotes, refuted
+SELECT at_ns, claims, refuted_claims, quotes, refuted_quotes, refuted, seen FROM (
+  SELECT DISTINCT ON (layer, tile) layer, tile, at_ns, claims, refuted_claims, quotes, refuted_quotes, refuted, seen
   FROM agreement_test
   WHERE vehicle = :vehicle AND at_ns > COALESCE((SELECT until_ns FROM pardon WHERE vehicle = :vehicle), -1)
   ORDER BY layer, tile, at_ns DESC, report_id

@@ -356,20 +356,20 @@ ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
 SELECT vehicle FROM shifted_vehicle ORDER BY vehicle
 
 -- name: agreement_tests_of_tile
-SELECT report_id, claims, refuted_claims, quotes, refuted_quotes, refuted FROM agreement_test
+SELECT report_id, claims, refuted_claims, quotes, refuted_quotes, refuted, seen FROM agreement_test
 WHERE layer = :layer AND tile = :tile AND report_id IN (SELECT value FROM json_each(:ids))
 
 -- name: put_agreement_test
 INSERT INTO agreement_test
-  (layer, tile, report_id, vehicle, at_ns, claims, refuted_claims, quotes, refuted_quotes, refuted)
+  (layer, tile, report_id, vehicle, at_ns, claims, refuted_claims, quotes, refuted_quotes, refuted, seen)
 VALUES
-  (:layer, :tile, :report_id, :vehicle, :at_ns, :claims, :refuted_claims, :quotes, :refuted_quotes, :refuted)
+  (:layer, :tile, :report_id, :vehicle, :at_ns, :claims, :refuted_claims, :quotes, :refuted_quotes, :refuted, :seen)
 ON CONFLICT (layer, tile, report_id) DO UPDATE
 SET claims = excluded.claims, refuted_claims = excluded.refuted_claims, quotes = excluded.quotes,
-    refuted_quotes = excluded.refuted_quotes, refuted = excluded.refuted
+    refuted_quotes = excluded.refuted_quotes, refuted = excluded.refuted, seen = excluded.seen
 
 -- name: agreement_tests_of_vehicle
-SELECT MAX(at_ns), claims, refuted_claims, quotes, refuted_quotes, refuted FROM agreement_test
+SELECT MAX(at_ns), claims, refuted_claims, quotes, refuted_quotes, refuted, seen FROM agreement_test
 WHERE vehicle = :vehicle AND at_ns > COALESCE((SELECT until_ns FROM pardon WHERE vehicle = :vehicle), -1)
 GROUP BY layer, tile ORDER BY MAX(at_ns) DESC, layer, tile LIMIT :n
 
@@ -566,6 +566,16 @@ SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING 
   LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
 WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
   AND r.window > COALESCE(m.window, -1)
+
+-- name: tiles_claimed_alone
+SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING (layer, tile)
+  LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
+WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
+  AND r.window > COALESCE(m.window, -1)
+  AND (EXISTS (SELECT 1 FROM standing AS s
+               WHERE s.layer = r.layer AND s.tile = r.tile AND s.vehicle = r.vehicle AND s.alone > 0)
+    OR EXISTS (SELECT 1 FROM waiting_change AS w
+               WHERE w.layer = r.layer AND w.tile = r.tile AND w.vehicle = r.vehicle))
 
 -- name: delete_waiting
 DELETE FROM waiting_change WHERE layer = :layer AND tile = :tile
@@ -1889,6 +1899,10 @@ CREATE TABLE district_list (
   signer    BLOB    NOT NULL CHECK (length(signer) = 8),
   signature BLOB    NOT NULL CHECK (length(signature) = 64)
 ) STRICT;
+
+-- name: schema_of_seen
+-- Step of the schema. How many voxels of the tile that hold something a judged report has seen; 0: not noted.
+ALTER TABLE agreement_test ADD COLUMN seen INTEGER NOT NULL DEFAULT 0 CHECK (seen >= 0);
 
 -- name: district_list
 SELECT region, districts, number, signed_s, signer, signature FROM district_list WHERE layer = :layer
