@@ -31,7 +31,7 @@ from gnd.fleet_sim.dense_scan import DenseScan, ScanPlan
 from gnd.fleet_sim.errors import TruthError
 from gnd.fleet_sim.world import STATES, World, to_json
 from gnd.gnd_map.accumulate import N_MIN_CELLS
-from gnd.gnd_map.bounded import json_value
+from gnd.gnd_map.bounded import json_value, npz_arrays
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.geodesy import LocalFrame
@@ -48,6 +48,8 @@ BoolArray = NDArray[np.bool_]
 
 _FORMAT: Final = "gnd.truth"
 _VERSION: Final = 2
+MAX_BYTES: Final = 1 << 31
+"""Of all arrays of a truth file, unpacked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,8 +280,8 @@ def read_truth(path: Path) -> Truth:
 
 
 def _truth_in(path: Path) -> Truth:
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        data = dict(file)
+    with path.open("rb") as stream:
+        data = npz_arrays(stream, MAX_BYTES)
     head = json_value(str(data["head"]))
     if (head.get("format"), head.get("version")) != (_FORMAT, _VERSION):
         raise TruthError(f"{path} is no truth file of version {_VERSION}")

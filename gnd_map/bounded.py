@@ -1,4 +1,4 @@
-"""JSON, TOML and packed bytes of others, read within bounds: whatever is wrong with them is a ValueError.
+"""JSON, TOML, arrays and packed bytes of others, read within bounds: whatever is wrong with them is a ValueError.
 
 The libraries alone do not do that: texts that nest deeply give a RecursionError, and a few packed bytes unpack to
 gigabytes before anybody has looked at them.
@@ -6,10 +6,13 @@ gigabytes before anybody has looked at them.
 
 import json
 import tomllib
+import zipfile
 import zlib
-from typing import Any, Final
+from typing import IO, Any, Final
 
+import numpy as np
 import zstandard
+from numpy.typing import NDArray
 
 MAX_WINDOW_BYTES: Final = 1 << 27
 """What Zstandard uses up to level 19; a frame may ask for more than a machine has."""
@@ -56,3 +59,19 @@ def zstd_unpacked(packed: bytes, most_bytes: int) -> bytes:
         return unpacker.decompress(packed, max_output_size=most_bytes, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise ValueError(f"{len(packed)} bytes are no Zstandard frame of at most {most_bytes}: {error}") from None
+
+
+def npz_arrays(stream: IO[bytes], most_bytes: int) -> dict[str, NDArray[Any]]:
+    """The arrays of a file of `np.savez` by name, none of objects.
+
+    Raises:
+        ValueError: they unpack to more than `most_bytes`.
+        What else numpy, zipfile and zlib raise: it is damaged.
+    """
+    with zipfile.ZipFile(stream) as archive:  # reads no more of a member than it says here
+        size = sum(member.file_size for member in archive.infolist())
+    if size > most_bytes:
+        raise ValueError(f"arrays that unpack to {size} bytes, at most {most_bytes} are read")
+    stream.seek(0)
+    with np.load(stream, allow_pickle=False) as file:
+        return dict(file)

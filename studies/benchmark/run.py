@@ -27,6 +27,7 @@ from studies.benchmark.errors import BenchmarkError
 from studies.benchmark.export import GIVEN, MARK, tiles_of
 from studies.benchmark.files import read_cloud, read_json, sha_of
 from studies.benchmark.frames import IndexFrame
+from studies.benchmark.kit.score import SubmissionError, plain_name
 from studies.frame.kept import Kept, key_of, sources_sha
 from studies.frame.options import check, option
 from studies.frame.pool import Job, Tick, run_jobs
@@ -119,8 +120,7 @@ def run_entry(
     mark = read_json(folder / MARK)
     if not mark.get("finished"):
         raise BenchmarkError(f"the export into {folder} has not ended: start it again, it goes on where it was")
-    worlds = {one["name"]: WorldFolder(folder / "worlds" / one["name"], tuple(one["vehicles"]))
-              for one in mark["worlds"]}  # fmt: skip
+    worlds = worlds_of(folder, mark)
     submission.parent.mkdir(parents=True, exist_ok=True)
     work = submission.parent / DRIVES
     drives = [(world, vehicle, kept_of(work, name, world, vehicle, options))
@@ -132,6 +132,19 @@ def run_entry(
               for name, world in worlds.items()]  # fmt: skip
     found = dict(zip(worlds, run_jobs(merges, 1, progress, "merges"), strict=True))
     return write_submission(submission, found)
+
+
+def worlds_of(folder: Path, mark: Mapping[str, Any]) -> dict[str, WorldFolder]:
+    """The folders of the worlds that an export names.
+
+    Raises:
+        BenchmarkError: it names none, or one outside of itself.
+    """
+    try:
+        named = {plain_name(one["name"]): tuple(map(plain_name, one["vehicles"])) for one in mark["worlds"]}
+    except (SubmissionError, KeyError, TypeError) as error:
+        raise BenchmarkError(f"{folder / MARK}: {error}") from error
+    return {name: WorldFolder(folder / "worlds" / name, vehicles) for name, vehicles in named.items()}
 
 
 def kept_of(work: Path, name: str, world: WorldFolder, vehicle: str, options: EntryOptions) -> Kept:

@@ -15,6 +15,7 @@ from typing import Any
 import dpkt
 import laspy
 import numpy as np
+import pyarrow as pa
 from bag_testing import cloud as ros_cloud
 from bag_testing import fix as ros_fix
 from bag_testing import write_bag
@@ -26,6 +27,7 @@ from fuzz_target import FuzzTarget
 from lzf_testing import lzf_compress
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from ouster_testing import capture_packets, metadata, write_pcap
+from pyarrow import feather
 from targets_bus import ITEM_MESSAGES, _items
 
 from gnd.gnd_map.geodesy import LocalFrame
@@ -35,6 +37,7 @@ from gnd.schemas.drive_mcap import ITEM_TOPICS, DriveWriter, item_of, load_track
 from gnd.schemas.trajectory_files import kitti_text, read_kitti, read_tum, times_text, tum_text
 from gnd.vehicle_agent.importer import open_recording
 from gnd.vehicle_agent.importers.apollo_map import read_ndt_map
+from gnd.vehicle_agent.importers.argoverse_logs import _columns
 from gnd.vehicle_agent.importers.fields import scan_of_fields
 from gnd.vehicle_agent.importers.files import read_file
 from gnd.vehicle_agent.importers.ouster.metadata import read_metadata
@@ -168,6 +171,16 @@ def _pcd_folder() -> dict[str, bytes]:
     return {f"scans/{k:06d}.pcd": _pcd("binary") for k in range(3)} | {
         "scans/poses.txt": "".join(f"{k * 0.1} {k} 0 0 0 0 0 1\n" for k in range(3)).encode()
     }
+
+
+def _feathers() -> list[bytes]:
+    table = pa.table({"x": np.arange(9.0), "laser_number": np.arange(9, dtype=np.uint8)})
+    coded = pa.table({"x": pa.array(["a"] * 9).dictionary_encode(), "laser_number": table["laser_number"]})
+    found = []
+    for one, packed in ((table, "zstd"), (table, "uncompressed"), (coded, "lz4")):
+        feather.write_feather(one, out := io.BytesIO(), compression=packed)
+        found.append(out.getvalue())
+    return found
 
 
 def _las(compress: bool = False) -> bytes:
@@ -390,6 +403,8 @@ TARGETS = (
                rounds=40),
     FuzzTarget("laz", (), "LAZ files", in_recording("laz", _las_files("laz"), "1.laz", opened("las")),
                lambda: [_las(True)], bytes_mutated, rounds=40),
+    FuzzTarget("feather", (f"{_IMPORTERS}/feather_header.py:read_feather",), "tables of Argoverse 2 (Feather)",
+               on_file("a.feather", lambda path: _columns(path, ("x", "laser_number"))), _feathers, bytes_mutated),
     FuzzTarget("xz", (f"{_IMPORTERS}/files.py:read_file",), "packed scans (xz)", on_file("a.bin.xz", read_file),
                lambda: [lzma.compress(_bins(4))], _xz, rounds=20),
     FuzzTarget("point-cloud2", (f"{_IMPORTERS}/point_cloud2.py:decode_cloud", f"{_IMPORTERS}/fields.py:unpack"),

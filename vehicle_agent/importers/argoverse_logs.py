@@ -6,6 +6,7 @@ where they did. City coordinates are UTM less a city's origin; the datum of heig
 of the drive: Argo's clock begins in 1980.
 """
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +21,7 @@ from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.attached_poses import with_table
 from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.feather_header import read_feather
 from gnd.vehicle_agent.importers.files import check_folder, files_of
 from gnd.vehicle_agent.importers.optional import library
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
@@ -93,8 +95,10 @@ def _city(folder: Path) -> tuple[int, F64, tuple[str, ...]]:
 
 def _columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     feather = library("pyarrow.feather", EXTRA)
+    data = read_feather(path)
     try:
-        table = feather.read_table(path)
+        table = feather.read_table(BytesIO(data))
+        table.validate(full=True)  # what a column holds lies within its buffers
         return {name: table[name].to_numpy() for name in names}
     except Exception as error:
         raise ImportDriveError(

@@ -17,6 +17,7 @@ from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.attached_poses import with_table
 from gnd.vehicle_agent.importers.bins import read_bin
 from gnd.vehicle_agent.importers.choices import Choices
+from gnd.vehicle_agent.importers.files import named_file
 from gnd.vehicle_agent.importers.recording import NOMINAL, Entry, Recording, RecordingAnchor
 from gnd.vehicle_agent.importers.trajectories.pose_table import PoseTable
 
@@ -45,21 +46,27 @@ def open_nuscenes(folder: Path, anchor: RecordingAnchor | None, choices: Choices
     """A scene of the data set; of several the one that `choices.topic` names.
 
     Raises:
-        ImportDriveError: tables that are missing or do not fit each other, several scenes, no sweeps.
+        ImportDriveError: tables that are missing or do not fit each other, several scenes, no sweeps, a sweep's file
+            outside of the data set.
     """
     choices = choices or Choices()
     root = next(path for path in (*folder.glob("v1.0-*"), folder) if (path / "sample_data.json").is_file())
     tables = {name: _table(root / f"{name}.json") for name in TABLES}
     base = root if root == folder and not root.name.startswith("v1.0") else root.parent
     try:
-        return _open(base, tables, anchor, choices)
+        return _open(base, root / "sample_data.json", tables, anchor, choices)
     except KeyError as error:
         raise ImportDriveError(f"{root}: tables that do not fit each other: no {error}") from None
 
 
-def _open(base: Path, tables: dict[str, dict[str, Row]], anchor: RecordingAnchor | None, choices: Choices) -> Recording:
+def _open(
+    base: Path, listed: Path, tables: dict[str, dict[str, Row]], anchor: RecordingAnchor | None, choices: Choices
+) -> Recording:
     scene = _scene(base, tables["scene"], choices.topic)
-    rows = _sweeps(base, tables, scene["token"])
+    rows = _sweeps(tables, scene["token"])
+    files = [named_file(base, row["filename"], listed) for row in rows]
+    rows = [row for row, path in zip(rows, files, strict=True) if path.is_file()]
+    files = [path for path in files if path.is_file()]
     if len(rows) < 2:
         raise ImportDriveError(f"{base}: scene {scene['name']}: {len(rows)} sweeps of {CHANNEL}; at least 2 are needed")
     calibration = tables["calibrated_sensor"][rows[0]["calibrated_sensor_token"]]
@@ -71,7 +78,7 @@ def _open(base: Path, tables: dict[str, dict[str, Row]], anchor: RecordingAnchor
         source="nuScenes (Caesar et al.), CC BY-NC-SA 4.0",
         T_vehicle_lidar=_pose(calibration),
         t_ns=t_ns,
-        read=lambda i: read_bin(base / rows[i]["filename"], int(t_ns[i]), 5),
+        read=lambda i: read_bin(files[i], int(t_ns[i]), 5),
         anchor=anchor or NOMINAL,
         placed=anchor is not None,
         entries=(
@@ -104,8 +111,8 @@ def _scene(base: Path, scenes: dict[str, Row], wanted: str | None) -> Row:
     return next(iter(names.values()))
 
 
-def _sweeps(base: Path, tables: dict[str, dict[str, Row]], scene: str) -> list[Row]:
-    """Rows of the scene's sweeps whose files are there, in time order."""
+def _sweeps(tables: dict[str, dict[str, Row]], scene: str) -> list[Row]:
+    """Rows of the scene's sweeps, in time order."""
     found = []
     for row in tables["sample_data"].values():
         sensor = tables["calibrated_sensor"][row["calibrated_sensor_token"]]["sensor_token"]
@@ -114,7 +121,7 @@ def _sweeps(base: Path, tables: dict[str, dict[str, Row]], scene: str) -> list[R
             and tables["sample"][row["sample_token"]]["scene_token"] == scene
         ):
             found.append(row)
-    return sorted((row for row in found if (base / row["filename"]).is_file()), key=lambda row: row["timestamp"])
+    return sorted(found, key=lambda row: row["timestamp"])
 
 
 def _pose(row: Row) -> F64:

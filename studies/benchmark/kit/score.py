@@ -10,6 +10,7 @@ import argparse
 import csv
 import json
 import math
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ CLASSES: Final = ("normal", "new", "modified", "deleted", "empty")
 CHANGES: Final = ("new", "modified", "deleted")
 LEVELS: Final = ("observable", "all", "scored")
 MERGED: Final = "merged"
+NAME: Final = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
+"""Of a world or a vehicle: no name leads out of the folder."""
 MOST: Final = 1e9
 """No world has a voxel or a metre so far away."""
 
@@ -341,6 +344,19 @@ def _worst(parts: Mapping[str, Any]) -> dict[str, Any]:
     return {level: low[level] | {"false_per_1000": high[level]["false_per_1000"]} for level in LEVELS}
 
 
+def plain_name(name: Any) -> str:
+    """The name of a world or a vehicle, which is that of its folder, too.
+
+    Raises:
+        SubmissionError: it could lead out of the folder of the benchmark.
+    """
+    if not isinstance(name, str) or not re.fullmatch(NAME, name):
+        raise SubmissionError(
+            f"{str(name)[:80]!r} is no name of a world or a vehicle: letters, digits, _ - and . inside"
+        )
+    return name
+
+
 def read_worlds(folder: Path) -> dict[str, ScoredWorld]:
     """Read all worlds of an exported benchmark, with their truth.
 
@@ -358,7 +374,7 @@ def read_worlds(folder: Path) -> dict[str, ScoredWorld]:
     if not found.get("finished"):
         raise SubmissionError(f"the export into {folder} has not ended: start it again, it goes on where it was")
     try:
-        worlds = [(str(one["name"]), tuple(map(str, one["vehicles"]))) for one in found["worlds"]]
+        worlds = [(plain_name(one["name"]), tuple(map(plain_name, one["vehicles"]))) for one in found["worlds"]]
     except (KeyError, TypeError) as error:
         raise SubmissionError(f"{folder}/benchmark.json: worlds with names and vehicles are needed: {error}") from error
     return {name: ScoredWorld.read(folder, name, vehicles) for name, vehicles in worlds}
