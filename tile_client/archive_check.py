@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 SEEN_FILE: Final = "archives_seen.json"
 CATALOGS_SEEN_FILE: Final = "catalogs_seen.json"
 MOST_SEEN: Final = 65_536
-MOST_SEEN_BYTES: Final = 16 * 1024 * 1024
+MOST_SEEN_BYTES: Final = 8 * 1024 * 1024
+"""128 of each state; JSON takes up to 20 times as much in memory."""
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -91,7 +92,7 @@ class SeenStates:
 
     def _read(self, path: Path) -> None:
         try:
-            for name, order in seen_of(path.read_bytes()).items():
+            for name, order in read_seen(path.read_bytes()).items():
                 self._take(name, order)
         except FileNotFoundError:
             pass
@@ -132,7 +133,7 @@ def bytes_of_seen(seen: Mapping[str, SealNumber]) -> bytes:
     return json.dumps({"sha256": _checksum(told), "states": told}).encode()
 
 
-def seen_of(data: bytes) -> dict[str, SealNumber]:
+def read_seen(data: bytes) -> dict[str, SealNumber]:
     """The states in a file.
 
     Raises:
@@ -154,7 +155,7 @@ def seen_of(data: bytes) -> dict[str, SealNumber]:
 
 def _state(signed_s: int, number: int) -> SealNumber:
     if not (type(signed_s) is type(number) is int and 0 <= signed_s < 2**48 and 0 <= number < 2**48):
-        raise SeenDamaged(f"a state with time {signed_s!r} and number {number!r}: 0 .. {2**48 - 1}")
+        raise SeenDamaged(f"a state with time {str(signed_s)[:40]} and number {str(number)[:40]}: 0 .. {2**48 - 1}")
     return SealNumber(signed_s, number)
 
 

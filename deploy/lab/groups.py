@@ -90,7 +90,10 @@ def parse_groups(text: str) -> tuple[Group, ...]:
         LinkError: unknown profile.
     """
     groups: list[Group] = []
-    for word in filter(None, (part.strip() for part in text.split(","))):
+    words = [word for word in (part.strip() for part in text.split(",")) if word]
+    if len(words) > MAX_AGENTS:
+        raise LabError(f"{len(words)} groups: at most {MAX_AGENTS}, of one vehicle each")
+    for word in words:
         profile, count = _split(word)
         groups.append(Group(_unused(profile.name, groups), profile, sum(g.count for g in groups), count))
     total = sum(group.count for group in groups)

@@ -54,6 +54,11 @@ def counts_table() -> str:
 
 def add_results() -> None:
     """Add the runs of the results to the counts; the results are put aside, so that none counts twice."""
+    if not RESULTS.is_file():
+        sys.exit(
+            f"{RESULTS} is not there: no run of tests/fuzz/run.py since the last --add. The tables need no runs:"
+            " they are written from tests/fuzz/counts.json without --add."
+        )
     counts = json.loads(COUNTS.read_text(encoding="utf-8"))
     for line in RESULTS.read_text(encoding="utf-8").splitlines():
         said = json.loads(line)

@@ -1,10 +1,13 @@
 """Targets: seals, certificates, lists of an authority, and what vehicles tell of versions on trial."""
 
 import datetime as dt
+import json
 import warnings
 from contextlib import suppress
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
+from random import Random
 from tempfile import TemporaryDirectory
 
 from cryptography import x509
@@ -25,8 +28,10 @@ from gnd.fleet_bus.seal_keys import certificates_of, holder_of, holder_of_chain,
 from gnd.fleet_bus.seals import Seal
 from gnd.fleet_bus.short_seals import ShortSeal, TerseSeal
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.archive_seal import SealNumber
 from gnd.schemas.generated import health_report_pb2
 from gnd.schemas.health import HealthReport, TileHealth
+from gnd.tile_client.archive_check import bytes_of_seen, read_seen
 
 _NOW = dt.datetime(2026, 11, 23, tzinfo=dt.UTC)
 _TILE = TileId(497353963154)
@@ -43,6 +48,23 @@ def _authority() -> tuple[x509.Certificate, bytes, ec.EllipticCurvePrivateKey]:
     revoked = x509.CertificateRevocationListBuilder().issuer_name(name).last_update(_NOW)
     revoked = revoked.next_update(_NOW + dt.timedelta(days=1)).add_extension(x509.CRLNumber(1), critical=False)
     return certificate, revoked.sign(key, hashes.SHA256()).public_bytes(Encoding.PEM), key
+
+
+def _seen() -> list[bytes]:
+    states = {"catalog/ndt/7": SealNumber(1_700_000_000, 3), "list/ndt/": SealNumber(1, 2**48 - 1)}
+    before = {name: [one.signed_s, one.number] for name, one in states.items()}  # releases before wrote no checksum
+    return [bytes_of_seen(states), bytes_of_seen({}), json.dumps(before).encode()]
+
+
+def _seen_mutated(data: bytes, rng: Random) -> bytes:
+    """Half of the time with the checksum of what it says now, where it is still an object of states."""
+    changed = text_mutated(data, rng)
+    with suppress(ValueError, TypeError, KeyError, RecursionError):
+        if rng.randrange(2):
+            told = json.loads(changed)
+            told["sha256"] = sha256(json.dumps(told["states"], sort_keys=True).encode()).hexdigest()
+            return json.dumps(told).encode()
+    return changed
 
 
 def _chain() -> bytes:
@@ -127,6 +149,14 @@ TARGETS = (
         lambda data: TerseSeal.decode(data).whole("question", b"key", 1000).encode(),
         _terse_seals,
         bytes_mutated,
+    ),
+    FuzzTarget(
+        "seen-states",
+        ("tile_client/archive_check.py:read_seen",),
+        "which catalogs, lists and archives were seen (JSON)",
+        read_seen,
+        _seen,
+        _seen_mutated,
     ),
     FuzzTarget(
         "known-certificates",

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import fuzz_table
+import pytest
 from fuzz_all import TARGETS
 from fuzz_paths import ROOT
 from fuzz_table import PAGE, counts_table, table
@@ -159,3 +161,13 @@ def test_the_page_lists_the_targets() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert table() in page, "run: python tests/fuzz/fuzz_table.py"
     assert counts_table() in page, "run: python tests/fuzz/fuzz_table.py"
+
+
+def test_adding_without_runs_says_so(tmp_path, monkeypatch) -> None:
+    counts = fuzz_table.COUNTS.read_bytes()
+    monkeypatch.setattr(fuzz_table, "RESULTS", tmp_path / "results.jsonl")
+    with pytest.raises(
+        SystemExit, match="is not there: no run of tests/fuzz/run.py since the last --add"
+    ):
+        fuzz_table.add_results()
+    assert fuzz_table.COUNTS.read_bytes() == counts

@@ -101,7 +101,9 @@ def drawn_things(
 ) -> Iterator[tuple[Thing, MapFeature | None]]:
     """What a road has, each with its feature; None: its kind has no layer."""
     known = options.placement.height_known if options.placement else True
-    for thing in (*_borders(road), *things_of(road, file.roads)):
+    with np.errstate(all="ignore"):  # numbers may overflow on the way: what comes out is checked to be finite
+        things = (*_borders(road), *things_of(road, file.roads))
+    for thing in things:
         layer = options.layer_of(thing.kind)
         if layer == LEFT_OUT:
             yield thing, None

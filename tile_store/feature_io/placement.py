@@ -21,6 +21,8 @@ from gnd.tile_store.feature_io.errors import BadGeometry, FeatureFileError
 MAX_DISTANCE_M: Final = 50_000.0
 """Of a local point from the nearest pose: beyond, the plane of the frame has left the ground by 200 m."""
 
+_MOST_M: Final = 1e15
+"""Squares of it are finite; no map has a number beyond it."""
 _POSES: Final = 64
 _BLEND_M: Final = 10.0
 _ROUNDS: Final = 50
@@ -90,6 +92,8 @@ class Placement:
 
     def _nearest(self, places_m: F64, points_m: F64, n: int, what: str) -> tuple[F64, I64]:
         """(N, n) distances seen from above, and numbers, of the poses nearest to points (N, 3)."""
+        if not (np.abs(points_m) <= _MOST_M).all():  # NaN fails, too
+            raise BadGeometry(f"{what} points with numbers that are not finite, or beyond {_MOST_M:g} m")
         apart_m, which = cKDTree(places_m[:, :2]).query(points_m[:, :2], k=[*range(1, n + 1)])
         if len(points_m) and apart_m[:, 0].max() > MAX_DISTANCE_M:
             worst = int(apart_m[:, 0].argmax())

@@ -5,6 +5,7 @@ another. A joint is a successor where one lane is driven out of it and the other
 11.5 (lane linkage), 10.3 (road linkage) and 12 (junctions).
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final, TypeAlias
@@ -34,6 +35,7 @@ SUBTYPE_OF_TYPE: Final = {
 }  # fmt: skip
 """Types of lanes that become lanelets; borders of all types are features."""
 _OTHER: Final = {"start": "end", "end": "start"}
+_LANE_ID: Final = re.compile(r"[+-]?[0-9]{1,9}")
 
 
 def lanes_of(
@@ -142,7 +144,7 @@ def _junction_joints(roads: Mapping[str, Road], junction: Element) -> Iterator[t
         (near, near_end), (far, far_end) = _at(incoming, end), _at(other, contact)
         for link in connection.all("laneLink"):
             ids = link.attributes.get("from", ""), link.attributes.get("to", "")
-            if all(text.lstrip("+-").isdigit() for text in ids):
+            if all(_LANE_ID.fullmatch(text) for text in ids):
                 yield ((*near, int(ids[0])), near_end), ((*far, int(ids[1])), far_end)
 
 
