@@ -67,7 +67,8 @@ class ListCheck:
 
         Raises:
             RequestFailed: nobody answers within `timeout_s`.
-            NotSigned: of the lists that came none is to be used; or none came, and one was seen before.
+            NotSigned: of the lists that came none is to be used; or none came, and one was seen before, or one that
+                is not older than so long is wanted.
             SchemaError: an answer that is none.
         """
         with self._lock:
@@ -109,8 +110,23 @@ class ListCheck:
             _SELDOM.warning("%s", self._withheld(missing))
         if not good and (refused or missing):
             raise NotSigned(refused[0] if refused else self._withheld(missing))
+        if not good and not heads:
+            self._none_came()
         numbers = frozenset(number for one in good for number in one.numbers or ())
         return ListedDistricts(numbers, min((one.signature.signed_s for one in good), default=0))
+
+    def _none_came(self) -> None:
+        """A layer without tiles has no list, and one that is withheld shows none: tell it, or refuse what nobody signed
+        where a state of some age is wanted.
+        """
+        counted("catalog", "no list")
+        told = (
+            f"list of districts of layer {self._layer}: none came: the map has nothing of this layer, or all of it is"
+            " withheld; nobody has signed which"
+        )
+        if self._oldest_s is not None:
+            raise NotSigned(f"{told}, and one of the last {self._oldest_s / 3600:.1f} h is wanted")
+        _SELDOM.warning("%s", told)
 
     def _withheld(self, missing: set[str]) -> str:
         regions = ", ".join(sorted(name.partition("@")[2] for name in missing)[:3])

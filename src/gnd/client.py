@@ -83,7 +83,8 @@ def connect(
         router: endpoint of the router.
         timeout_s: how long a router is looked for, and how long each question is asked again, s.
         oldest_catalog_s: with an identity, a catalog that was signed longer ago is refused, s (shards sign each again
-            once an hour); None: any age will do, and one of more than a day is told in the log and by `Client.stale`.
+            once an hour), and so is a layer of which no signed list of districts comes; None: any age will do, and one
+            of more than a day is told in the log and by `Client.stale`.
         seen: with an identity, the file in which it is kept which catalogs and lists of districts were seen, so that
             older ones are refused after a new start, too; None: `catalogs_seen.json` in the folder of the identity.
 

@@ -159,6 +159,19 @@ def test_attack_no_list_at_all(scene: VersionScene) -> None:
     is_refused(scene, None, "that of region main was seen before and did not come", asking)
 
 
+def test_attack_a_whole_layer_is_withheld(scene: VersionScene, caplog: pytest.LogCaptureFixture) -> None:
+    """A layer is withheld with its list from who has never seen it, which looks like a layer that the map does not
+    have: it is told and counted, and refused by who wants a state that was signed within so long."""
+    before = dict(refusals()).get(("catalog", "no list"), 0)
+    scene.server.alter_lists = lambda _true: []
+    with caplog.at_level("WARNING"):
+        assert TileServerClient(scene.watcher, "walls", 10.0).catalog(EVERYWHERE) == []
+    assert "layer walls: none came: the map has nothing of this layer, or all of it is withheld" in caplog.text
+    with pytest.raises(NotSigned, match=r"none came.*and one of the last 1\.0 h is wanted"):
+        TileServerClient(scene.watcher, "walls", 10.0, oldest_catalog_s=3600.0).catalog(EVERYWHERE)
+    assert dict(refusals())["catalog", "no list"] == before + 2
+
+
 def test_attack_older_list(scene: VersionScene) -> None:
     """A true list of before a district was there: who has seen a newer one refuses it; a fresh client refuses the
     district that is not on it, and who wants one of the last hour refuses an old list."""
