@@ -2,9 +2,11 @@
 
 Each vehicle has a bucket of reports and one of bytes, which fill at a steady rate; so has its owner, where certificates
 tell owners. Without identity a name costs nothing: therefore new names are a bucket of their own, and begin with a part
-of what a vehicle that is known may send at once. What waits to be looked at is bounded for each vehicle and in all, by
-the store, which all shards share. Who is beyond a limit is told how long to wait, and loses nothing. While vehicles
-that are known send reports, those of newcomers wait a moment for a commit that the others cause anyway.
+of what a vehicle that is known may send at once. While vehicles that are known send reports, few names are let in at
+their first message; the others are told when to come again, and who does so is let in then, which somebody who sends
+each message under another name does not (greylisting, RFC 6647). What waits to be looked at is bounded for each vehicle
+and in all, by the store, which all shards share. Who is beyond a limit is told how long to wait, and loses nothing.
+While vehicles that are known send reports, those of newcomers wait a moment for a commit that the others cause anyway.
 """
 
 import math
@@ -33,6 +35,13 @@ OWNER_VEHICLES: Final = 1_000
 NAMES_A_MINUTE: Final = 1_200.0
 NAMES_AT_ONCE: Final = 600
 """New names: after a restart every vehicle is new."""
+FIRST_NAMES_A_MINUTE: Final = 60.0
+"""New names at their first message, while a known vehicle has come within `FIRST_COME_S` and names cost nothing ..."""
+FIRST_NAMES_AT_ONCE: Final = 20
+FIRST_COME_S: Final = 60.0
+AGAIN_A_MINUTE: Final = 240.0
+"""... and those that come again after they were told to."""
+AGAIN_AT_ONCE: Final = 120
 REMEMBERED_NAMES: Final = 65_536
 WAITING_OF_VEHICLE: Final = 256
 """Uploads of a vehicle that nobody has looked at."""
@@ -104,6 +113,7 @@ class Admission:
         store: knows what waits, of all shards.
         reports_a_minute: of a vehicle.
         owner_of: the owner of a vehicle, where certificates tell it; "" where not.
+        names_cost: whether certificates tell names; without them anybody may invent any number.
         clock_s: a clock that does not step, s.
     """
 
@@ -112,13 +122,18 @@ class Admission:
         store: Waiting,
         reports_a_minute: float = REPORTS_A_MINUTE,
         owner_of: Callable[[str], str] = lambda _vehicle: "",
+        names_cost: bool = False,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._store, self._rate, self._owner_of, self._clock_s = store, reports_a_minute, owner_of, clock_s
         self._lock = threading.Lock()
         self._accounts: OrderedDict[str, _Account] = OrderedDict()  # least lately used first
         self._owners: OrderedDict[str, _Account] = OrderedDict()
+        self._names_cost = names_cost
         self._names = TokenBucket(NAMES_A_MINUTE, NAMES_AT_ONCE, clock_s())
+        self._first_names = TokenBucket(FIRST_NAMES_A_MINUTE, FIRST_NAMES_AT_ONCE, clock_s())
+        self._again = TokenBucket(AGAIN_A_MINUTE, AGAIN_AT_ONCE, clock_s())
+        self._asked_s: OrderedDict[str, float] = OrderedDict()  # when a name came first that was not let in
         self._nonsense = TokenBucket(NONSENSE_A_MINUTE, NONSENSE_AT_ONCE, clock_s())
         self._waiting, self._looked_s = 0, clock_s() - LOOK_EVERY_S
         self._known_s = -math.inf
@@ -201,11 +216,25 @@ class Admission:
         if account is not None:
             self._accounts.move_to_end(vehicle)
             return account
-        missing_s = self._names.missing_s(1, now_s)
-        if missing_s > 0:
-            raise Busy(f"more than {NAMES_A_MINUTE:g} new vehicles a minute", WAITING_RETRY_S, "names")
-        self._names.take(1)
+        names = self._names_of(vehicle, now_s)
+        for one, a_minute in names:
+            if one.missing_s(1, now_s) > 0:
+                self._asked_s.setdefault(vehicle, now_s)
+                _shortened(self._asked_s)
+                raise Busy(f"more than {a_minute:g} new vehicles a minute", WAITING_RETRY_S, "names")
+        for one, _ in names:
+            one.take(1)
+        self._asked_s.pop(vehicle, None)
         return _kept(self._accounts, vehicle, self._new(now_s, 1, NEWCOMER_REPORTS))
+
+    def _names_of(self, vehicle: str, now_s: float) -> list[tuple[TokenBucket, float]]:
+        """The buckets that a new name is taken out of, and how much a minute they give."""
+        found = [(self._names, NAMES_A_MINUTE)]
+        if self._names_cost or now_s - self._known_s >= FIRST_COME_S:
+            return found
+        if now_s - self._asked_s.get(vehicle, math.inf) >= WAITING_RETRY_S:
+            return [*found, (self._again, AGAIN_A_MINUTE)]
+        return [*found, (self._first_names, FIRST_NAMES_A_MINUTE)]
 
     def _owner(self, owner: str, now_s: float) -> _Account:
         if owner in self._owners:
@@ -223,9 +252,13 @@ class Admission:
 
 def _kept(accounts: "OrderedDict[str, _Account]", name: str, account: _Account) -> _Account:
     accounts[name] = account
-    if len(accounts) > REMEMBERED_NAMES:
-        accounts.popitem(last=False)
+    _shortened(accounts)
     return account
+
+
+def _shortened(kept: "OrderedDict[str, _Account] | OrderedDict[str, float]") -> None:
+    if len(kept) > REMEMBERED_NAMES:
+        kept.popitem(last=False)
 
 
 def _check(account: _Account, vehicle: str, size_bytes: int, now_s: float) -> None:

@@ -76,7 +76,7 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | 
         words = PatientWords()
         states = States(store, bus, words)
         with worker_process(config, states.tell, metrics_at) as worker:
-            admission = Admission(store)
+            admission = Admission(store, names_cost=bus.certificate is not None)
             # look at the outside, keep the bytes
             ingest = Ingest(store, config.shard_id, on_stored=worker.wake, admission=admission, words=words)
             owners = KnownOwners(store)

@@ -37,7 +37,7 @@ from studies.frame.options import check, option
 from studies.small_cloud import TILE, SmallCloud, base_tile, change_report, small_cloud
 
 SESSIONS: Final = 4
-KINDS: Final = ("reports", "names", "nonsense")
+KINDS: Final = ("reports", "names", "returning", "nonsense")
 LEAD_S: Final = 2.0
 REQUEST_S: Final = 60.0
 Ack = tuple[int, float, bool]

@@ -5,6 +5,7 @@ import os
 import random
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,8 @@ from gnd.schemas.tiles_batch import TilesRequest
 FLOODER: Final = "flooder"
 T0_MS: Final = 1_700_000_000_000
 PATIENCE_MS: Final = 2_000
+AGAIN_S: Final = 6.0
+"""A busy cloud says 5 s (`WAITING_RETRY_S`)."""
 Message = tuple[str, bytes]
 
 
@@ -34,6 +37,18 @@ def reports(street: ChaosStreet, *, name_each: bool, salt: str, name: str = FLOO
         report_id = deterministic_report_id(T0_MS + n, salt, str(n))
         vehicle = f"{salt}-{n}" if name_each else name
         yield one.key, replace(one.packed, report_id=report_id, vehicle=vehicle).encode()
+
+
+def returning(street: ChaosStreet, salt: str) -> Iterator[Message]:
+    """Reports each of which has another name, and comes once more when that name was told to: whoever obeys, with names
+    without end.
+    """
+    sent: deque[tuple[float, Message]] = deque()
+    for message in reports(street, name_each=True, salt=salt):
+        sent.append((time.monotonic(), message))
+        yield message
+        if time.monotonic() - sent[0][0] >= AGAIN_S:
+            yield sent.popleft()[1]
 
 
 def nonsense(street: ChaosStreet, size: int) -> Iterator[Message]:
@@ -68,6 +83,8 @@ def messages(kind: str, tile: TileId, name: str = FLOODER) -> Iterator[Message]:
         return nonsense(street, 8_000_000)
     if kind == "oversize":
         return ((key, bytes(12_000_000)) for key, _ in nonsense(street, 1))
+    if kind == "returning":
+        return returning(street, salt)
     return reports(street, name_each=kind == "names", salt=salt, name=name)
 
 

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from gnd.cloud_merger.admission import KNOWN_AFTER_S
 from gnd.deploy.chaos.street import ChaosStreet
 from gnd.deploy.processes import ProcessSpec
 from gnd.fleet_bus.bus import Bus
@@ -27,9 +28,9 @@ _NUMBERS = itertools.count(1)
 class Honest:
     """A vehicle that does as it should."""
 
-    def __init__(self, bus: Bus, store: Store, street: ChaosStreet) -> None:
-        self.bus, self.store, self.street = bus, store, street
-        self._base = base_tile()
+    def __init__(self, bus: Bus, store: Store, street: ChaosStreet, vehicle: str = HONEST) -> None:
+        self.bus, self.store, self.street, self.vehicle = bus, store, street, vehicle
+        self._base, self._began_s = base_tile(), time.monotonic()
 
     def reports(self) -> str:
         """Its report is acknowledged within a request's usual time; the id."""
@@ -37,12 +38,19 @@ class Honest:
         t_ms = 1_700_000_000_000 + number
         report = replace(
             change_report(number, self._base),
-            report_id=deterministic_report_id(t_ms, HONEST, str(number)),
-            vehicle=HONEST,
+            report_id=deterministic_report_id(t_ms, self.vehicle, str(number)),
+            vehicle=self.vehicle,
         )
         ack = self.send(change_key("ndt", TILE.district), report.encode())
         assert ack.status in ("stored", "duplicate"), ack
         return report.report_id
+
+    def becomes_known(self) -> None:
+        """It reports until shards know its name, and once more."""
+        while time.monotonic() - self._began_s < KNOWN_AFTER_S + 2.0:
+            self.reports()
+            time.sleep(1.0)
+        self.reports()
 
     def send(self, key: str, body: bytes) -> ChangeAck:
         return ChangeAck.decode(self.bus.request(key, body, kind="change", timeout_s=REQUEST_S))
@@ -57,7 +65,7 @@ class Honest:
         question = ReportQuestion((report_id,)).encode()
 
         def state() -> str:
-            answer = self.bus.request(state_key(HONEST), question, kind="change", timeout_s=REQUEST_S)
+            answer = self.bus.request(state_key(self.vehicle), question, kind="change", timeout_s=REQUEST_S)
             return ReportStates.decode(answer).states[0].status
 
         wait_for(lambda: state() == "released", "the report is released")

@@ -28,7 +28,16 @@ import zenoh
 from limits_scene import HONEST, Honest, flooding, store_bytes, wait_for
 from ulid import ULID
 
-from gnd.cloud_merger.admission import NONSENSE_AT_ONCE, REPORTS_AT_ONCE, WAITING_OF_ALL, WAITING_OF_VEHICLE
+from gnd.cloud_merger.admission import (
+    AGAIN_A_MINUTE,
+    FIRST_NAMES_A_MINUTE,
+    FIRST_NAMES_AT_ONCE,
+    NONSENSE_AT_ONCE,
+    REPORTS_AT_ONCE,
+    WAITING_OF_ALL,
+    WAITING_OF_VEHICLE,
+    WAITING_RETRY_S,
+)
 from gnd.cloud_merger.features.kept import square
 from gnd.deploy.chaos.street import ChaosStreet, read_street
 from gnd.deploy.processes import ProcessSpec
@@ -36,7 +45,7 @@ from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig, zenoh_config
 from gnd.fleet_bus.errors import Busy, RequestFailed
 from gnd.fleet_bus.guard import USUAL_LIMITS, ConnectionGuard
-from gnd.fleet_bus.requesting import COUNT_WANTED, LONGEST_BUSY_S
+from gnd.fleet_bus.requesting import BUSY_SPREAD, COUNT_WANTED, LONGEST_BUSY_S
 from gnd.fleet_bus.router import open_router
 from gnd.fleet_bus.seals import MARK
 from gnd.fleet_bus.seldom import LINES_A_MINUTE, MAX_LINE_CHARACTERS
@@ -790,3 +799,20 @@ def test_attack_reports_as_expensive_as_they_may_be(cloud, honest):
         assert honest.send(*dearest_report(sizes)).status == "stored"
     honest.hears(honest.reports())
     wait_for(lambda: waiting(cloud, "dear") == 0, "all are looked at")
+
+
+def test_attack_invented_names_while_a_newcomer_comes(cloud, honest):
+    """While a known vehicle reports, 200 reports a second have a new name each: few of them are taken, and a true new
+    vehicle, which comes again when it is told to, is let in within the time that it is told."""
+    honest.becomes_known()
+    before, began_s = sum(cloud.store.upload_counts().by_state.values()), time.monotonic()
+    with flooding(cloud, "names", 200.0, for_s=2.0), open_bus(BusConfig(connect=(cloud.connect,)), name="new") as bus:
+        honest.is_served()
+        newcomer = Honest(bus, cloud.store, honest.street, vehicle=f"newcomer-{os.getpid()}")
+        asked_s = time.monotonic()
+        newcomer.reports()
+        assert time.monotonic() - asked_s < BUSY_SPREAD * WAITING_RETRY_S + 10.0
+        honest.is_served()
+    taken = sum(cloud.store.upload_counts().by_state.values()) - before
+    minutes = (time.monotonic() - began_s) / 60.0
+    assert taken <= FIRST_NAMES_AT_ONCE + minutes * (FIRST_NAMES_A_MINUTE + AGAIN_A_MINUTE) + 20

@@ -98,13 +98,59 @@ def test_new_names_share_a_bucket_and_known_ones_do_not_feel_it(desk, clock):
     assert len(desk) <= admission.NAMES_AT_ONCE
 
 
+def test_while_known_vehicles_come_few_names_are_let_in_at_once_and_who_comes_again_is(desk, clock):
+    def invented(start: int, n: int) -> int:
+        return sum(admitted(desk, f"invented-{start + k}", 1) for k in range(n))
+
+    admitted(desk, "car", 1)
+    clock.now_s += admission.KNOWN_AFTER_S
+    admitted(desk, "car", 1)  # known from now on
+    assert invented(0, 1000) == admission.FIRST_NAMES_AT_ONCE
+    clock.now_s += 60.0
+    admitted(desk, "car", 1)
+    taken = 0
+    for second in range(60):  # 200 other names a second, and one that obeys
+        taken += invented(10_000 + 200 * second, 200)
+        if second == 10:
+            with pytest.raises(Busy, match="more than 60 new vehicles a minute") as told:
+                desk.admit("key", head("newcomer"), 100)
+            assert (told.value.retry_after_s, told.value.reason) == (admission.WAITING_RETRY_S, "names")
+        if second == 14:
+            assert admitted(desk, "newcomer", 1) == 0, "before its time"
+        if second == 15:
+            assert admitted(desk, "newcomer", 1) == 1
+        clock.now_s += 1.0
+        admitted(desk, "car", 1)
+    assert taken <= admission.FIRST_NAMES_AT_ONCE + 60
+    assert admitted(desk, "newcomer", 10) == 10
+    before = len(desk)
+    for second in range(60):  # and names that all obey: so many a minute
+        invented(100_000 + 200 * (second % 6), 200)
+        clock.now_s += 1.0
+        admitted(desk, "car", 1)
+    assert len(desk) - before <= admission.AGAIN_AT_ONCE + admission.AGAIN_A_MINUTE + admission.FIRST_NAMES_AT_ONCE + 60
+    clock.now_s += admission.FIRST_COME_S
+    assert invented(200_000, 1000) == admission.NAMES_AT_ONCE, "nobody who is known comes: as after a start"
+
+
+def test_names_that_certificates_tell_are_let_in_at_once(store, clock):
+    desk = Admission(store, 60.0, names_cost=True, clock_s=clock)
+    admitted(desk, "car", 1)
+    clock.now_s += admission.KNOWN_AFTER_S
+    admitted(desk, "car", 1)
+    assert sum(admitted(desk, f"vehicle-{n}", 1) for n in range(1000)) == admission.NAMES_AT_ONCE
+
+
 def test_memory_is_bounded_whatever_names_are_invented(desk, clock, monkeypatch):
     monkeypatch.setattr(admission, "REMEMBERED_NAMES", 50)
     for n in range(300):
         clock.now_s += 1.0
         admitted(desk, f"invented-{n}", 1)
         admitted(desk, "car", 1)
+    for n in range(300):
+        admitted(desk, f"at-once-{n}", 1)
     assert len(desk) == 50
+    assert len(desk._asked_s) == 50
     assert "car" in desk._accounts
 
 

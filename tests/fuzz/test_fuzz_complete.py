@@ -166,8 +166,6 @@ def test_the_page_lists_the_targets() -> None:
 def test_adding_without_runs_says_so(tmp_path, monkeypatch) -> None:
     counts = fuzz_table.COUNTS.read_bytes()
     monkeypatch.setattr(fuzz_table, "RESULTS", tmp_path / "results.jsonl")
-    with pytest.raises(
-        SystemExit, match="is not there: no run of tests/fuzz/run.py since the last --add"
-    ):
+    with pytest.raises(SystemExit, match=r"is not there: no run of tests/fuzz/run.py since the last --add"):
         fuzz_table.add_results()
     assert fuzz_table.COUNTS.read_bytes() == counts
