@@ -11,11 +11,13 @@ from pathlib import Path
 import hypothesis
 import pytest
 from postgres_fixtures import new_database, postgres
+from prepared import prepared
 from suite_groups import (
     pytest_collection_modifyitems,
     pytest_configure_node,
     pytest_xdist_make_scheduler,
 )
+from suite_kernels import choose_kernels
 from suite_ports import new_port
 from web_fixtures import new_bucket, s3_server, served
 
@@ -24,6 +26,7 @@ __all__ = [
     "new_bucket",
     "new_database",
     "postgres",
+    "prepared",
     "pytest_collection_modifyitems",
     "pytest_configure_node",
     "pytest_xdist_make_scheduler",
@@ -50,9 +53,10 @@ def pytest_configure() -> None:
 
     While tests are collected nothing becomes garbage: to look for it takes a third of that time.
 
-    Tests are of the source, compiled by numba; those of tests/ahead of libraries. GND_KERNELS=FILE tests all on one.
+    Tests are of the source, compiled by numba; programs that they start run a library of it (`suite_kernels`). Those of
+    tests/ahead are of libraries. GND_KERNELS=numba or FILE tests all on one.
     """
-    os.environ.setdefault("GND_KERNELS", "numba")
+    choose_kernels()
     gc.disable()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -66,7 +70,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes() -> None:
-    """Compile the kernels of vehicle, cloud and simulator before the processes start: see `suite_kernels`."""
+    """Have the kernels of vehicle, cloud and simulator ready before the processes start: see `suite_kernels`."""
     subprocess.run([sys.executable, str(WARM_UP)], check=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
 
 

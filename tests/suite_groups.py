@@ -129,12 +129,17 @@ class Together:
 
 
 def shared_by(item: pytest.Item) -> set[str]:
-    """What a test shares with other modules: session fixtures of its folder, and what its marks name."""
+    """What a test shares with other modules: session fixtures of its folder, and what its marks name.
+
+    What a session fixture gets from `prepared` is made once for all processes, and ties nobody.
+    """
     assert isinstance(item, pytest.Function)
     of_folders = {
         f"{fixtures[-1].baseid}::{name}"
         for name, fixtures in item._fixtureinfo.name2fixturedefs.items()
-        if fixtures[-1].scope == "session" and fixtures[-1].baseid not in ("", "tests")
+        if fixtures[-1].scope == "session"
+        and fixtures[-1].baseid not in ("", "tests")
+        and "prepared" not in fixtures[-1].argnames
     }
     return of_folders | {str(mark.args[0]) for mark in item.iter_markers("xdist_group")}
 

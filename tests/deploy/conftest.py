@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from fleet_testing import Run
+from prepared import Prepared
 
 from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from gnd.fleet_sim.street import street
@@ -25,16 +26,20 @@ class SmallWorld:
 
 
 @pytest.fixture(scope="session")
-def small_world(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
-    folder = tmp_path_factory.mktemp("world")
+def small_world(prepared: Prepared) -> SmallWorld:
+    folder = prepared("small_world", make_small_world)
+    return SmallWorld(folder / "base.sqlite", tuple(folder / f"car-{n}.mcap" for n in range(2)))
+
+
+def make_small_world(folder: Path) -> None:
     world = street(SEED)
     mapping = DriveConfig("mapper", "VLP-16", "before", errors=PERFECT, car_share=0.0, scans=SCANS + 20, cruise_mps=7.0)
     mapped = simulate_drive(world, mapping, folder / "mapper.mcap")
     with SqliteStore(folder / "base.sqlite") as store:
         build_map([mapped], store)
     configs = [DriveConfig(f"car-{n}", "VLP-16", seed=SEED + n, scans=SCANS) for n in range(2)]
-    drives = tuple(simulate_drive(world, config, folder / f"{config.vehicle}.mcap") for config in configs)
-    return SmallWorld(folder / "base.sqlite", drives)
+    for config in configs:
+        simulate_drive(world, config, folder / f"{config.vehicle}.mcap")
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from suite_ports import new_port
 from gnd.fleet_bus.identity.names import MemberName
 from gnd.tile_store.location import open_store
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600), pytest.mark.xdist_group("fleets")]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600), pytest.mark.xdist_group("hosts")]
 MEMBERS = {
     **{name: MemberName("router", name) for name in ("router", *(f"router-{which}" for which in "01ab2"))},
     **{name: MemberName("tiles", name) for name in ("store", "tiles", "tiles-a", "tiles-b")},

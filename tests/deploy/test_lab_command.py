@@ -16,7 +16,7 @@ from gnd.deploy.lab.lab import lab_lock, namespaces_of
 from gnd.deploy.lab.namespaces import add_namespace
 from gnd.deploy.lab.tools import TUN_DEVICE
 
-pytestmark = pytest.mark.xdist_group("fleets")
+pytestmark = pytest.mark.xdist_group("hosts")
 
 TINY = "[tiny]\ndown_bit_s = 2e6\nup_bit_s = 1e6\ndelay_ms = 10\njitter_ms = 2\nloss = 0.02\n"
 PROJECT = Path(__file__).resolve().parents[2]

@@ -15,7 +15,7 @@ from gnd.deploy.lab.devices import MTU_BYTES
 if TYPE_CHECKING:
     from conftest import SmallWorld
 
-pytestmark = [needs_root, pytest.mark.slow, pytest.mark.xdist_group("fleets")]
+pytestmark = [needs_root, pytest.mark.slow, pytest.mark.xdist_group("hosts")]
 
 RUN_TIMEOUT_S = 280
 PROFILES = """

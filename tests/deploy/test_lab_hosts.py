@@ -28,7 +28,7 @@ pytestmark = [
     needs_root,
     pytest.mark.slow,
     pytest.mark.timeout(1000),
-    pytest.mark.xdist_group("fleets"),
+    pytest.mark.xdist_group("hosts"),
     pytest.mark.skipif(not _has_server(), reason="needs the programs of a PostgreSQL server"),
 ]
 

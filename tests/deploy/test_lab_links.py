@@ -33,7 +33,7 @@ from gnd.deploy.lab.tables import run_table, run_verdict
 from gnd.deploy.processes import ProcessSpec, Supervisor
 from gnd.fleet_bus.ledger_file import read_ledger
 
-pytestmark = [needs_root, pytest.mark.xdist_group("fleets")]
+pytestmark = [needs_root, pytest.mark.xdist_group("hosts")]
 
 OWN_NAMESPACE = Path("/proc/thread-self/ns/net")
 PROFILES = """

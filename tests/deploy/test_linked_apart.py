@@ -13,7 +13,7 @@ from lab_testing import needs_root, own_name, wait_until
 from gnd.deploy.lab.namespaces import add_namespace, remove_namespace, run_tool
 from gnd.fleet_bus.config import PLAIN_VARIABLE
 
-pytestmark = [needs_root, pytest.mark.slow, pytest.mark.xdist_group("fleets")]
+pytestmark = [needs_root, pytest.mark.slow, pytest.mark.xdist_group("hosts")]
 APART_S = 8.0
 HUB, REGION = "10.98.6.1", "10.98.6.2"
 

@@ -43,14 +43,22 @@ def test_street_that_has_changed(outdated_map):
     assert min(ratios) < 0.85 < max(ratios)  # it did pass what has changed
 
 
-def half_on_half(
-    kind: str, folder: Path, out: Path, parameters: LocaliserParameters | None = None
-) -> LocalisationError:
-    """Even scans build the map, odd scans drive on it; the error against the LiDAR odometry of both."""
+def write_halves(kind: str, folder: Path, out: Path) -> Path:
+    """Even and odd scans as two drives, both with the LiDAR odometry of all."""
     recording = open_recording(kind, folder)
     track = map_track(recording)
     for half in ("even", "odd"):
         write_drive(recording, track, out / f"{half}.mcap", half, stand_ins=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def radiate(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_halves("radiate", shared_data / "radiate_fog", tmp_path_factory.mktemp("radiate"))
+
+
+def half_on_half(out: Path, parameters: LocaliserParameters | None = None) -> LocalisationError:
+    """Even scans build the map, odd scans drive on it; the error against the LiDAR odometry of both."""
     run = replay(out / "odd.mcap", map_of([out / "even.mcap"], grid_frame_of(out / "odd.mcap")), parameters)
     assert len(run.final) == run.scans
     assert {estimate.health for estimate in run.final} == {"good"}
@@ -59,26 +67,26 @@ def half_on_half(
 
 @pytest.mark.slow
 def test_kitti_half_on_half(shared_data, tmp_path):
-    error = half_on_half("kitti", shared_data / "kitti00_start16", tmp_path)
+    error = half_on_half(write_halves("kitti", shared_data / "kitti00_start16", tmp_path))
     assert error.longitudinal_p95_m < 0.02
     assert error.lateral_p95_m < 0.02
     assert error.heading_p95_deg < 0.05
 
 
 @pytest.mark.slow
-def test_radiate_in_fog_half_on_half(shared_data, tmp_path):
+def test_radiate_in_fog_half_on_half(radiate):
     """Speed and yaw rate are the recording's own, 1 to 2 % and several centimetres a step off."""
     single = LocaliserParameters(refine=RefineParameters(enabled=False))
-    error = half_on_half("radiate", shared_data / "radiate_fog", tmp_path, single)
+    error = half_on_half(radiate, single)
     assert error.longitudinal_p95_m < 0.05
     assert error.lateral_p95_m < 0.02
     assert error.heading_p95_deg < 0.1
 
 
 @pytest.mark.slow
-def test_radiate_in_fog_half_on_half_with_submaps(shared_data, tmp_path):
+def test_radiate_in_fog_half_on_half_with_submaps(radiate):
     """Submaps are worse there than single scans: where the map ends they slide (docs/decisions/0053)."""
-    error = half_on_half("radiate", shared_data / "radiate_fog", tmp_path)
+    error = half_on_half(radiate)
     assert error.longitudinal_p95_m < 0.09
     assert error.lateral_p95_m < 0.04
     assert error.heading_p95_deg < 0.1

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from prepared import Prepared
 
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -36,12 +37,15 @@ def bus(endpoint: str) -> Iterator[Bus]:
 
 
 @pytest.fixture(scope="session")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recordings(prepared: Prepared) -> Path:
     """A map of the first part of a street, and a later drive through it."""
-    folder, world = tmp_path_factory.mktemp("street"), street(101)
+    return prepared("recordings", make_recordings)
+
+
+def make_recordings(folder: Path) -> None:
+    world = street(101)
     mapper = DriveConfig("mapper", "HDL-32E", state="before", errors=PERFECT, car_share=0.0, scans=60)
     simulate_drive(world, mapper, folder / "mapper.mcap")
     simulate_drive(world, DriveConfig("probe", "VLP-16", seed=4, scans=55), folder / "probe.mcap")
     with SqliteStore(folder / "map.sqlite") as store:
         build_map([folder / "mapper.mcap"], store)
-    return folder
