@@ -6,7 +6,7 @@ ARGS ?=
 PYTHONS ?= $(PYTHON)
 TOOLS := build/tools
 # Tests run in three processes, also on two cores: those of the bus and of attacks wait for much of their time.
-# Whole fleets run one after the other in one of them, shards that are killed in another: they need the cores.
+# Whole fleets run one after the other in one of them, hosts in another, shards that are killed too: they need the cores.
 TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 3 || echo 0)
 SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
