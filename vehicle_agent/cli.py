@@ -64,8 +64,11 @@ def agent(
     All settings: docs/configuration.md. They come from --config FILE, the environment (GND_AGENT__PACE=1) and --set
     (report.longest_s=30), in this order; options go before all.
     """
+    from gnd.extras import need_vehicle
     from gnd.vehicle_agent.agent import run_agent
     from gnd.vehicle_agent.settings import load_agent
+
+    need_vehicle()
 
     logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(asctime)s %(name)s %(message)s")
     options = plain | {

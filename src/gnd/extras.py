@@ -16,6 +16,8 @@ _EXTRA_OF_MODULE: Final = {**dict.fromkeys(OF_THE_PAGE, "serve"), "small_gicp": 
 """What one extra alone brings; small_gicp has no wheel for every machine that all others have one for."""
 OF_A_FLEET: Final = LEFT_OUT - _EXTRA_OF_MODULE.keys()
 """What a whole fleet cannot run without."""
+OF_A_VEHICLE: Final = frozenset(("gtsam", "scipy"))
+"""What one cannot run without: much of it only where it finds poles, new roads or lanes, and then it is too late."""
 EXTRA_OF: Final = {
     "gnd.vehicle_agent": "vehicle",
     "gnd.cloud_merger": "cloud",
@@ -49,6 +51,17 @@ def need_all() -> None:
     missing = sorted(name for name in OF_A_FLEET if not _is_there(name))
     if missing:
         raise MissingExtra(f"{', '.join(missing)}: not installed; this command needs: pip install 'gnd-fleet[all]'")
+
+
+def need_vehicle() -> None:
+    """For who drives: refuse to begin where something is missing that may be needed on the road.
+
+    Raises:
+        MissingExtra: with the module that is missing.
+    """
+    missing = sorted(name for name in OF_A_VEHICLE if not _is_there(name))
+    if missing:
+        raise MissingExtra(f"{missing[0]} is not installed; it comes with: pip install 'gnd-fleet[vehicle]'")
 
 
 def _is_there(module: str) -> bool:

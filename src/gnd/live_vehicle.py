@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnd.client import Client
-from gnd.extras import explained
+from gnd.extras import explained, need_vehicle
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.features import FeatureTile
@@ -84,6 +84,7 @@ class Vehicle:
         layer: str = DEFAULT_LAYER,
         parameters: "PipelineParameters | None" = None,
     ) -> None:
+        need_vehicle()
         with explained():
             importlib.import_module("gnd.vehicle_agent.pipeline")  # now, not at the first position
         T_vehicle_lidar = np.ascontiguousarray(mount, np.float64)

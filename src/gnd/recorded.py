@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gnd.extras import explained
+from gnd.extras import explained, need_vehicle
 from gnd.map_reader import AnyTime, Map, time_ns
 from gnd.schemas.drive import DriveHeader, DriveItem
 from gnd.schemas.drive_mcap import DriveCounts, drive_counts, read_drive, read_header
@@ -75,6 +75,7 @@ def localise(
         DriveError, StoreError: one of the two cannot be read.
         MissingExtra: `gnd-fleet[vehicle]` is not installed.
     """
+    need_vehicle()
     with explained():
         from gnd.vehicle_agent.localise_drive.run import localise_drive
         from gnd.vehicle_agent.localise_drive.tiles import StoreMap

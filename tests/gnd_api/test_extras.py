@@ -112,7 +112,8 @@ def test_a_map_is_read(cloud: Cloud, bare: Callable[..., Program]) -> None:
 COMMANDS = {
     "sim world picture street.json street.png": ("sim", "scipy"),
     "merger --help": ("cloud", "scipy"),
-    "localise --help": ("vehicle", r"\w+"),
+    "localise drive.mcap --map map.sqlite": ("vehicle", "gtsam"),
+    "agent --drive drive.mcap": ("vehicle", "gtsam"),
 }
 
 
@@ -135,6 +136,8 @@ def test_a_command_without_its_extra_says_which_in_one_line(
         "map --help",
         "watch --help",
         "router --help",
+        "localise --help",
+        "agent --help",
         "traffic --help",
         "config show fleet",
         "config show store",

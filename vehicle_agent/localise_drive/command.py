@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gnd.ending import ENDING_SIGNALS, exit_code, orderly
+from gnd.extras import need_vehicle
 from gnd.tile_store.arguments import parse_time_ns
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
@@ -47,6 +48,7 @@ def localise(
     Writes the refined and the online poses (TUM, KITTI, MCAP, GeoJSON and CSV), the health timeline and pictures;
     prints what came of it, with errors where the drive has a reference. Ctrl-C ends it and keeps what is there.
     """
+    need_vehicle()
     chosen, folder = chosen_formats(formats), out or Path("runs") / f"localise-{drive.stem}"
     check_is_drive(drive)
     make_folder(folder)
