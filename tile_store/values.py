@@ -533,7 +533,8 @@ class AgreementTest:
         quotes: voxels that are as they were, by its word, and that others can judge, ...
         refuted_quotes: ... of which so many have changed by theirs.
         is_refuted: it is contradicted as a whole.
-        seen: voxels of the tile that hold something, before or by its word, and that it has seen; 0: not known.
+        seen: voxels of the tile that it has seen and others could judge, those included that it says have come; 0: not
+            known.
     """
 
     report_id: str
@@ -660,7 +661,7 @@ class VehicleTrust:
         by: "agreement" or "operator"; "": it is not quarantined.
         why: reason in a line.
         since_ns: when it was quarantined, UTC; 0: it is not.
-        seen: voxels of those tiles that hold something and that it has seen; 0: not known.
+        seen: voxels of those tiles that it has seen and others could judge; 0: not known.
     """
 
     vehicle: str

@@ -69,7 +69,6 @@ def agent(
     from gnd.vehicle_agent.settings import load_agent
 
     need_vehicle()
-
     logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(asctime)s %(name)s %(message)s")
     options = plain | {
         "drive": None if drive is None else str(drive),

@@ -48,8 +48,7 @@ def need_all() -> None:
     Raises:
         MissingExtra: with the modules that are missing.
     """
-    missing = sorted(name for name in OF_A_FLEET if not _is_there(name))
-    if missing:
+    if missing := _missing(OF_A_FLEET):
         raise MissingExtra(f"{', '.join(missing)}: not installed; this command needs: pip install 'gnd-fleet[all]'")
 
 
@@ -59,9 +58,12 @@ def need_vehicle() -> None:
     Raises:
         MissingExtra: with the module that is missing.
     """
-    missing = sorted(name for name in OF_A_VEHICLE if not _is_there(name))
-    if missing:
+    if missing := _missing(OF_A_VEHICLE):
         raise MissingExtra(f"{missing[0]} is not installed; it comes with: pip install 'gnd-fleet[vehicle]'")
+
+
+def _missing(modules: frozenset[str]) -> list[str]:
+    return sorted(name for name in modules if not _is_there(name))
 
 
 def _is_there(module: str) -> bool:
