@@ -7,7 +7,9 @@ from gnd.cloud_merger.decide_kernels import decided
 from gnd.cloud_merger.merge_kernels import clusters_of
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.shift import SHIFT_LEAST_GAUSSIANS, shift_of
-from gnd.cloud_merger.statements import STATEMENT
+from gnd.cloud_merger.statements import STATEMENT, Report, statements_of
+from gnd.cloud_merger.votes import TileVotes
+from gnd.gnd_map.arrays import I32
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import (
     REPORT,
@@ -43,6 +45,9 @@ def warm_up() -> None:
     decode_mask(encode_mask(np.array([True])), 1)
     observed_along(Track(_TILE.district, TrackView((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (_place(),)), [found])
     similarity(base.exists, base.mean_m, base.cov_m2, base.exists, base.mean_m, base.cov_m2)
+    said = Report("warm-up", _changed(base.voxel_id, base))
+    TileVotes.of([said]).about(base.voxel_id, b"", {})
+    statements_of(base, [said], {})
     clusters_of(np.zeros(1, STATEMENT), MergeParameters())
     decided(np.zeros(1, STATEMENT), base, MergeParameters())
     place = np.zeros(1, np.int64)
@@ -57,8 +62,14 @@ def _test_a_shift() -> None:
     n = len(ids)
     count, cov = np.full(n, 40, np.int32), np.tile(np.array([0.08, 0.0, 0.0, 0.08, 0.0, 0.0004], np.float32), (n, 1))
     low, high = (Gaussians(ids, count, count, np.full((n, 3), up_m, np.float32), cov) for up_m in (0.0, 0.4))
+    shift_of(_changed(ids, high), low)
+
+
+def _changed(observed: I32, found: Gaussians) -> TileChange:
+    """What one without a map says of what it has found."""
+    n = len(found)
     evidence, classes = np.zeros((n, 4), np.int32), np.full(n, ChangeClass.MODIFIED, np.uint8)
-    shift_of(TileChange(_TILE, 0, b"", ids, high, classes, evidence, 0.0, 0.0), low)
+    return TileChange(_TILE, 0, b"", observed, found, classes, evidence, 0.0, 0.0)
 
 
 def _place() -> TrackPiece:

@@ -12,6 +12,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -54,12 +55,14 @@ def warm_up_simulator(folder: Path) -> None:
 
 def kernels_now() -> str:
     """A digest of all kernels as their source is now, and of what their machine code depends on beside."""
+    from gnd.ahead.build import SCENES
     from gnd.ahead.fingerprint import fingerprint
     from gnd.ahead.library import environment, name_of
     from gnd.deploy.doctor.programs import all_kernels
 
     told = sorted((name_of(one), fingerprint(one.plain)) for one in all_kernels())
-    return hashlib.sha256(repr((environment(), told)).encode()).hexdigest()
+    scenes = [Path(str(import_module(name).__file__)).read_bytes() for name in SCENES]  # they say what it holds
+    return hashlib.sha256(repr((environment(), told, scenes)).encode()).hexdigest()
 
 
 def is_current(now: str) -> bool:

@@ -7,13 +7,14 @@ from merger_world import POLE, TILE, WALL_AGAIN
 from short_world import bases_of, drive_number, packed_of, tile_at
 from street_corner import displaced, mapped, seen_as, street
 
-from gnd.cloud_merger import confirmation, decide_kernels, merge_kernels, shift_kernels
+from gnd.cloud_merger import confirmation, decide_kernels, merge_kernels, shift_kernels, statements, votes
 from gnd.cloud_merger.decide_kernels import decided
 from gnd.cloud_merger.expanding import expand, with_measured
 from gnd.cloud_merger.merge_kernels import clusters_of
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.shift import shift_of
-from gnd.cloud_merger.statements import STATEMENT
+from gnd.cloud_merger.statements import STATEMENT, Report, statements_of
+from gnd.cloud_merger.votes import TileVotes
 from gnd.cloud_merger.warm import warm_up
 from gnd.gnd_map import sight, similarity
 from gnd.gnd_map.codec import encode_mask, kernels, lattice_kernels
@@ -23,7 +24,18 @@ from gnd.vehicle_agent.report.packing import askable, pack_measured
 CORNER = mapped(street(0))
 
 
-KERNELS = (sight, kernels, lattice_kernels, similarity, confirmation, decide_kernels, merge_kernels, shift_kernels)
+KERNELS = (
+    sight,
+    kernels,
+    lattice_kernels,
+    similarity,
+    confirmation,
+    decide_kernels,
+    merge_kernels,
+    shift_kernels,
+    statements,
+    votes,
+)
 
 
 def signatures():
@@ -49,6 +61,9 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     found = with_measured(expanded, {TILE: tile_at().gaussians}, mask, half.measured).tiles[0].changed
     yes = found.exists
     similarity.similarity(yes, found.mean_m, found.cov_m2, yes, found.mean_m, found.cov_m2)
+    told = [Report("a", expanded.tiles[0]), Report("b", expanded.tiles[0])]
+    TileVotes.of(told).about(found.voxel_id, expanded.tiles[0].base_sha, bases_of(report))
+    statements_of(tile_at().gaussians, told, bases_of(report))
     clusters_of(np.zeros(5, STATEMENT), MergeParameters())
     decided(np.zeros(5, STATEMENT), found, MergeParameters())
     assert shift_of(seen_as(CORNER, displaced(street(1), 0.2, 0.3)), CORNER).is_explained

@@ -5,11 +5,13 @@ import os
 import signal
 import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
+from pathlib import Path
 
 import apsw
 import pytest
 from load_testing import make_run
+from suite_kernels import is_current, kernels_now
 
 from gnd.deploy.errors import LoadError
 from gnd.deploy.load.client import start_file
@@ -25,18 +27,38 @@ pytestmark = pytest.mark.xdist_group("fleets")
 OPTIONS = LoadOptions(vehicles=4, km=0.25, kmh=180.0, per_street=2, shards=1, clients=1, in_flight=8)
 
 
-def loaded(tmp_path, options, store=None):
+def loaded(tmp_path, options, store=None, look=lambda *_: None):
     run, folder = make_run(tmp_path / "run"), tmp_path / "load"
     folder.mkdir()
-    return run_load(options, KeptRuns(run), folder, lambda *_: None, threading.Event(), store), folder
+    return run_load(options, KeptRuns(run), folder, look, threading.Event(), store), folder
+
+
+class LookForCompiler:
+    """Which processes of a load have had the compiler of numba in their memory, and which were looked at."""
+
+    def __init__(self, folder):
+        self.pids, self.seen, self.compiling = folder / "pids.json", set(), set()
+
+    def __call__(self, *_told):
+        if self.pids.exists():
+            for name, pid in json.loads(self.pids.read_text(encoding="utf-8")).items():
+                for one in (pid, *children(pid)):
+                    with suppress(OSError):
+                        mapped = Path(f"/proc/{one}/maps").read_text(encoding="utf-8")
+                        self.seen.add(name if one == pid else f"{name}'s worker")
+                        self.compiling |= {f"{name} ({one})"} if "llvmlite" in mapped else set()
 
 
 @pytest.mark.slow
 def test_a_cloud_keeps_up_with_a_few_vehicles(tmp_path):
-    outcome, folder = loaded(tmp_path, OPTIONS)
+    compiler = LookForCompiler(tmp_path / "load")
+    outcome, folder = loaded(tmp_path, OPTIONS, look=compiler)
     told = summary(outcome)
     assert told["why_not"] == []
     assert told["kept_up"] is True
+    assert {"store", "merger-0", "merger-0's worker"} <= compiler.seen
+    if is_current(kernels_now()):  # as `make test` has it
+        assert compiler.compiling == set(), "a kernel that it needs is not in the library"
     assert told["reports"] == told["acknowledged"] == outcome.planned > 25
     assert told["lost"] == 0
     with closing(apsw.Connection(str(folder / "store.sqlite"), flags=apsw.SQLITE_OPEN_READONLY)) as store:
