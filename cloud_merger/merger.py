@@ -179,6 +179,8 @@ def run_worker(
                 for claim in claims:
                     leases.drop(claim)  # they run out, and whoever can work then has them
                 stop.wait(STORE_RETRY_S)
+        merged = ", ".join(f"{n} {outcome}" for outcome, n in metrics.merges().items())
+        _LOG.info("merger %s: its worker ends; merges of tiles: %s", config.shard_id, merged)
 
 
 def _settle(worker: Worker, claims: Sequence[Claim], metrics: ShardMetrics) -> None:

@@ -58,6 +58,11 @@ class ShardMetrics:
         """Counts one merge; None: it has failed or its lease was gone."""
         self._settled.labels("failed" if result is None else result.status).inc()
 
+    def merges(self) -> dict[str, int]:
+        """Merges so far, by what came of them."""
+        (family,) = self._settled.collect()
+        return {s.labels["outcome"]: int(s.value) for s in family.samples if s.name == "gnd_merges_total"}
+
     def announced(self, n: int) -> None:
         """Counts notices."""
         self._notices.inc(n)

@@ -12,22 +12,36 @@ from gnd.deploy.fleet import SHARD_DEFAULTS
 from gnd.deploy.load.plan import Timetable
 from studies.frame.errors import OptionError
 from studies.scale.loads import KINDS, Kind, Loads, MeasuredLoad, WorkerCosts
-from studies.scale.model import CloudModel, CpuCosts, HostRules, Said, SimulatedReport, SimulatedRun
+from studies.scale.model import STREET, CloudModel, CpuCosts, HostRules, Said, SimulatedReport, SimulatedRun
 
 SEEDS: Final = (1, 2, 3)
 """Of which tiles are asked for; figures are medians over them."""
 ROUNDS: Final = 6
 """How often costs are taken anew from the merges that the model makes with them; they hardly change after the first."""
+CROWDS: Final = (0.0,)
 NOTICE_SHARES: Final = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 QUANTILES: Final = {"p50": 0.5, "p95": 0.95}
 
 
 @dataclass(frozen=True, slots=True)
 class FittedStore:
-    """What one kind of store costs; of tiles with changes the share that is asked for, by edition of the street."""
+    """What one kind of store costs.
+
+    Attributes:
+        costs: on a core on which a unit of the yardstick takes `unit_ms`.
+        asked: of tiles with changes the share that is asked for, by edition of the street.
+        again: for each merge of what has come, the merges of what was known, likewise.
+        unit_ms: CPU.
+    """
 
     costs: CpuCosts
     asked: Mapping[str, float]
+    again: Mapping[str, float]
+    unit_ms: float
+
+    def costs_beside(self, unit_ms: float) -> CpuCosts:
+        """On a core that is worth as much as it was in a load."""
+        return self.costs.times(unit_ms / self.unit_ms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +85,7 @@ def reports_of(load: MeasuredLoad, loads: Loads, asked: Mapping[str, float], see
         disputed = streets[edition].disputed
         says = tuple(
             (
-                1000 * due.street + tile,
+                STREET * due.street + tile,
                 said("quiet" if tile not in disputed else "plain" if quiet else None, asked[edition], rng),
             )
             for tile, quiet in tiles
@@ -91,7 +105,14 @@ def simulated(load: MeasuredLoad, loads: Loads, fitted: FittedStore, seed: int) 
     rules = HostRules(
         shards=load.setting.shards, merge_delay_s=store["merge_delay_s"], merge_after=int(store["merge_after_reports"])
     )
-    return CloudModel(fitted.costs, rules, seed).run(reports_of(load, loads, fitted.asked, seed), 3600.0)
+    options = load.setting.options()
+
+    def again(street: int) -> float:
+        return fitted.again["changed" if options.is_changed(street) else "settled"]
+
+    return CloudModel(fitted.costs_beside(load.unit_ms), rules, seed, again).run(
+        reports_of(load, loads, fitted.asked, seed), 3600.0
+    )
 
 
 def foretold(load: MeasuredLoad, loads: Loads, fitted: FittedStore) -> Foretold:
@@ -109,9 +130,9 @@ def fitted_stores(loads: Loads) -> dict[Kind, FittedStore]:
     """Costs of each kind of store, from the loads to fit on and what other commands measure.
 
     Workers and receivers do the same whatever the store is, and use nearly the same CPU, so their loads are taken
-    together. What workers use beyond flags and second halves are the merges: so much each, and so much for each
-    pair of reports that a merge reads, by least squares over the loads; how many merges there are is the model's own
-    count. How much of a merge comes after its publication is what brings the median lag of these loads nearest. A
+    together. What workers use beyond flags and second halves are the merges, and a little that each uses all the time,
+    by least squares over the loads; how many merges there are is the model's own count. The crowd is the one with which
+    these are missed least. How much of a merge comes after its publication is what brings the median lag of these loads nearest. A
     database adds its own CPU, to each cost the same share.
 
     Raises:
@@ -121,7 +142,8 @@ def fitted_stores(loads: Loads) -> dict[Kind, FittedStore]:
     if len(known) < 2:
         raise OptionError(f"{len(known)} loads to fit on; it takes 2")
     asked = {name: _asked(name, known, loads) for name in ("settled", "changed")}
-    found = FittedStore(_first_guess(known, loads.worker), asked)
+    unit_ms = float(np.median([one.unit_ms for one in loads.loads]))
+    found = FittedStore(_first_guess(loads.worker, unit_ms), asked, loads.worker.again, unit_ms)
     for _ in range(ROUNDS):
         found = replace(found, costs=_refined(found, known, loads))
     tried = [replace(found, costs=replace(found.costs, notice_share=share)) for share in NOTICE_SHARES]
@@ -140,7 +162,6 @@ def _with_database(costs: CpuCosts, known: list[MeasuredLoad]) -> CpuCosts:
         flags_s=more * costs.flags_s,
         half_s=more * costs.half_s,
         merge_s=more * costs.merge_s,
-        merge_pair_s=more * costs.merge_pair_s,
         database_share=1.0 - 1.0 / more,
     )
 
@@ -158,24 +179,40 @@ def _asked(edition: str, known: list[MeasuredLoad], loads: Loads) -> float:
     return min(1.0, sum(one.tiles_asked for one in some) / tiles)
 
 
-def _first_guess(known: list[MeasuredLoad], worker: WorkerCosts) -> CpuCosts:
-    uploads = sum(one.reports + one.halves for one in known)
-    received_s = sum(_spent(known, part) for part in ("router", "store", "shards"))
-    received_s += sum(one.client_cpu_s for one in known)
-    return CpuCosts(received_s / uploads, worker.flags_ms_a_tile / 1e3, worker.half_ms / 1e3, 0.01)
+def _first_guess(worker: WorkerCosts, unit_ms: float) -> CpuCosts:
+    scale_s = 1e-3 * unit_ms / worker.unit_ms
+    return CpuCosts(0.005, scale_s * worker.flags_ms_a_tile, scale_s * worker.half_ms, 0.01)
 
 
 def _refined(before: FittedStore, known: list[MeasuredLoad], loads: Loads) -> CpuCosts:
-    """Costs of merges, from the CPU that is left for them and the merges that the model counts."""
-    rows, left_s, versions = [], [], [0.0, 0.0]
+    """Costs of uploads and merges, from what other parts and the workers have used and the merges that the model counts."""
+    rows, versions = [], [0.0, 0.0]
     for load in known:
         runs = [simulated(load, loads, before, seed) for seed in SEEDS]
-        rows.append([float(np.median([getattr(run, what) for run in runs])) for what in ("merges", "merged_pairs")])
-        spent_s = load.tiles_told * before.costs.flags_s + load.halves * before.costs.half_s
-        left_s.append(load.cpu_s["workers"] - spent_s)
+        rows.append([float(np.median([run.merges for run in runs])), load.setting.shards * load.drained_s])
         versions[0] += load.versions
         versions[1] += float(np.median([run.versions for run in runs]))
-    weight = 1.0 / np.array(left_s)  # a load with little to do says as much as one with much
-    (merge_s, merge_pair_s), _ = nnls(np.array(rows) * weight[:, None], np.array(left_s) * weight)
+    spent_s = np.array([one.tiles_told * before.costs.flags_s + one.halves * before.costs.half_s for one in known])
+    worth = before.unit_ms / np.array([one.unit_ms for one in known])
+    used_s, others_s = (worth * np.array([part(one) for one in known]) for part in (_used_by_workers, _used_by_others))
+    weight = 1.0 / used_s  # a load with little to do says as much as one with much
+    further = np.array([one.setting.shards for one in known]) - 1.0
+
+    def solved(crowd: float) -> tuple[float, float, float]:
+        """How far the loads are missed with a crowd, the cost of a merge, and the crowd."""
+        left_s = used_s / (1.0 + crowd * further) - spent_s
+        (merge_s, _beside), missed = nnls(np.array(rows) * weight[:, None], left_s * weight)
+        return missed, merge_s, crowd
+
+    _, merge_s, crowd = min(solved(one) for one in CROWDS)
+    received_s = float(np.sum(others_s / (1.0 + crowd * further))) / sum(one.reports + one.halves for one in known)
     news = before.costs.news * (versions[0] / versions[1]) ** 2
-    return replace(before.costs, merge_s=float(merge_s), merge_pair_s=float(merge_pair_s), news=news)
+    return replace(before.costs, receive_s=received_s, merge_s=merge_s, crowd=crowd, news=news)
+
+
+def _used_by_workers(load: MeasuredLoad) -> float:
+    return load.cpu_s["workers"]
+
+
+def _used_by_others(load: MeasuredLoad) -> float:
+    return load.client_cpu_s + sum(load.cpu_s.get(part, 0.0) for part in ("router", "store", "shards"))

@@ -58,6 +58,8 @@ class MeasuredLoad:
         ack_ms, lag_s: quantiles, see docs/load.md.
         cpu_s: of the parts of the cloud.
         client_cpu_s: of the clients.
+        unit_ms: CPU of a unit of work of the yardstick, done on the same core in the same time: what the core was worth
+            beside its neighbours.
         core, load_average: where and when it was measured.
     """
 
@@ -76,6 +78,7 @@ class MeasuredLoad:
     lag_s: Mapping[str, float]
     cpu_s: Mapping[str, float]
     client_cpu_s: float
+    unit_ms: float
     core: int = 0
     load_average: float = 0.0
 
@@ -84,6 +87,8 @@ class MeasuredLoad:
             raise OptionError(
                 f"no load: store {self.store}, {self.reports} reports in {self.offered_s} s, {self.drained_s} s"
             )
+        if not self.unit_ms > 0.0:
+            raise OptionError(f"no load: a unit of the yardstick took {self.unit_ms} ms")
 
     @property
     def reports_per_s(self) -> float:
@@ -131,11 +136,21 @@ class StreetOfLoad:
 
 @dataclass(frozen=True, slots=True)
 class WorkerCosts:
-    """CPU of a worker without a bus, ms: from flags to the journal for a tile, from Gaussians for a report."""
+    """What one worker takes, without a bus.
+
+    Attributes:
+        flags_ms_a_tile: CPU from flags to the journal for a tile.
+        half_ms: CPU from Gaussians to the journal for a report.
+        tiles_a_report: in the reports that were taken for this.
+        again: of streets of each edition, merges of tiles about which nothing has come, for each of the others.
+        unit_ms: as a load has it.
+    """
 
     flags_ms_a_tile: float
     half_ms: float
     tiles_a_report: float
+    again: Mapping[str, float]
+    unit_ms: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +195,7 @@ def _median_of(loads: list[MeasuredLoad]) -> MeasuredLoad:
         offered_s=median(one.offered_s for one in loads),
         drained_s=median(one.drained_s for one in loads),
         client_cpu_s=median(one.client_cpu_s for one in loads),
+        unit_ms=median(one.unit_ms for one in loads),
         ack_ms=table("ack_ms"),
         lag_s=table("lag_s"),
         cpu_s=table("cpu_s"),

@@ -35,25 +35,37 @@ from gnd.tile_store.location import StoreLocation, open_store
 from studies.frame.errors import OptionError
 from studies.ingest import costs
 from studies.scale.loads import LoadSetting, MeasuredLoad
+from studies.scale.replay import replayed
 from studies.scale.room import Room, room
+from studies.scale.yardstick import units_beside
 from studies.short_corpus import corpus
 from studies.speed.__main__ import machine
 
 SETTINGS: Final = (
-    # Three to fit the costs on; on one hardly anything is done ...
+    # To fit the costs on: on one hardly anything is done, two leave the core idle, two offer more than it can do, and in
+    # one more workers share it ...
     LoadSetting("fit", vehicles=1, changed_share=1.0, kmh=15.0, km=0.2),
     LoadSetting("fit", vehicles=8, changed_share=0.0, km=0.8),
     LoadSetting("fit", vehicles=8, changed_share=1.0, km=0.8),
+    LoadSetting("fit", vehicles=72, changed_share=0.0),
+    LoadSetting("fit", vehicles=56, changed_share=1.0, shards=1),
+    LoadSetting("fit", vehicles=36, changed_share=0.5, shards=4),
     # ... and those that the model has to foretell.
     LoadSetting("compared", vehicles=4, changed_share=0.5, km=0.8),
     LoadSetting("compared", vehicles=14, changed_share=0.0, shards=1),
     LoadSetting("compared", vehicles=28, changed_share=1.0, shards=4),
     LoadSetting("compared", vehicles=40, changed_share=0.5),
+    LoadSetting("compared", vehicles=70, changed_share=1.0, shards=4),
+    LoadSetting("compared", vehicles=90, changed_share=0.5),
+    LoadSetting("compared", vehicles=20, changed_share=0.0),
+    LoadSetting("compared", vehicles=34, changed_share=1.0),
     # Measured when the model was finished.
-    LoadSetting("unseen", vehicles=20, changed_share=0.0),
-    LoadSetting("unseen", vehicles=34, changed_share=1.0),
+    LoadSetting("unseen", vehicles=12, changed_share=1.0, shards=1),
+    LoadSetting("unseen", vehicles=26, changed_share=0.3, shards=3),
+    LoadSetting("unseen", vehicles=64, changed_share=0.7),
 )
 DRAIN_S: Final = 120.0
+REPLAYED_VEHICLES: Final = 30
 ROUNDS: Final = 3
 
 
@@ -78,7 +90,7 @@ def main(
     told |= {"machine": machine(), "streets": _streets(Streets.of(runs, LoadOptions(changed_share=0.5)))}
     with room() as made:
         if worker:
-            told["worker"] = worker_costs()
+            told["worker"] = worker_costs(runs, made)
             out.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
         for number in numbers:
             for location in [None] * files + [store] * bool(store):
@@ -88,13 +100,32 @@ def main(
                 console.print(one)
 
 
-def worker_costs() -> dict[str, float]:
-    """CPU from flags to the journal for a tile, and from Gaussians to the journal for a report, ms: medians."""
+def worker_costs(runs: KeptRuns, made: Room) -> dict[str, Any]:
+    """CPU from flags to the journal for a tile, and from Gaussians to the journal for a report, ms: medians; and of
+    streets of each edition, how many merges of what was known there are for each of what has come (a replay).
+    """
     reports = corpus()
     tiles = float(np.mean([len(one.whole.tiles) for one in reports.reports]))
-    rounds = [{one.name: one.value for one in costs(reports)} for _ in range(ROUNDS)]
+    with units_beside(made) as units:
+        rounds = [{one.name: one.value for one in costs(reports)} for _ in range(ROUNDS)]
     flags, half = (median(one[f"CPU from {what} to the journal"] for one in rounds) for what in ("flags", "Gaussians"))
-    return {"flags_ms_a_tile": round(flags / tiles, 2), "half_ms": round(half, 2), "tiles_a_report": round(tiles, 1)}
+    again = {name: _merged_again(runs, share) for name, share in (("settled", 0.0), ("changed", 1.0))}
+    return {
+        "flags_ms_a_tile": round(flags / tiles, 2),
+        "half_ms": round(half, 2),
+        "tiles_a_report": round(tiles, 1),
+        "again": again,
+        "unit_ms": round(units.mean_ms(), 3),
+    }
+
+
+def _merged_again(runs: KeptRuns, share: float) -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        told, _ = replayed(
+            runs, LoadOptions(vehicles=REPLAYED_VEHICLES, km=0.4, kmh=60.0, changed_share=share), Path(folder)
+        )
+    again = told.count["merges of what was known"]
+    return round(again / (told.count["merges"] - again), 3)
 
 
 def measured(
@@ -126,15 +157,21 @@ def measured(
                 for name in [name for name in told if name.startswith("merger-")]:
                     made.bound(name, shard_share, told[name])
 
-        outcome = run_load(setting.options(DRAIN_S), runs, Path(folder), tell, threading.Event(), store)
+        with units_beside(made) as units:
+            outcome = run_load(setting.options(DRAIN_S), runs, Path(folder), tell, threading.Event(), store)
         made.unbound()
         with open_store(Path(folder) / "store.sqlite" if store is None else store, create=False) as opened:
             parts = Counter(row.part for row in opened.reports())
-    return measured_load(setting, "file" if store is None else "postgresql", outcome, parts)
+    unit_ms = units.mean_ms(outcome.start_s, outcome.drained_s or float("inf"))
+    return measured_load(setting, "file" if store is None else "postgresql", outcome, parts, unit_ms)
 
 
 def measured_load(
-    setting: LoadSetting, store: Literal["file", "postgresql"], outcome: LoadOutcome, parts: Mapping[int, int]
+    setting: LoadSetting,
+    store: Literal["file", "postgresql"],
+    outcome: LoadOutcome,
+    parts: Mapping[int, int],
+    unit_ms: float,
 ) -> MeasuredLoad:
     """The figures of a load that the model uses."""
     told, merged = summary(outcome), outcome.ledger.merged
@@ -157,6 +194,7 @@ def measured_load(
         lag_s=told["merge_lag_s"],
         cpu_s=dict(outcome.cpu_s),
         client_cpu_s=outcome.client_cpu_s,
+        unit_ms=round(unit_ms, 3),
     )
 
 

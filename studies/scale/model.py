@@ -9,8 +9,8 @@ four settled together. The database uses the same cores, or has some of its own,
 import heapq
 import random
 from collections import Counter, deque
-from collections.abc import Generator, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 import simpy
@@ -25,6 +25,8 @@ from studies.frame.errors import OptionError
 Step = Generator[simpy.Event, Any, None]
 Said = Literal["quiet", "plain", "asked"]
 """Of a tile, a report says that nothing has changed, says all that it is to say, or is asked for Gaussians."""
+STREET: Final = 1000
+"""A street has so many numbers for its tiles."""
 _ACK_FIRST: Final = 0
 _LATER: Final = 1
 
@@ -38,9 +40,9 @@ class CpuCosts:
         flags_s: a tile of the first half of a report, until it is in the journal.
         half_s: a second half.
         merge_s: a tile, with its publication and notice.
-        merge_pair_s: more for each pair of reports of its open window (n² of n): a merge holds them against each other.
         publish_s: of `merge_s`, for how long a publication has the database alone.
         notice_share: of a merge, what comes after the publication: notices, leases, looking for what is next.
+        crowd: of each shard beyond the first on a core, so much more CPU for all: more processes share its caches.
         news: of reports about a tile of which n are known, 1 / (1 + n / news) change it: what is told often is no news.
         database_share: of each, what the database server does.
         answer_s: time (no CPU of the cloud) in which a vehicle answers with its second half.
@@ -50,22 +52,27 @@ class CpuCosts:
     flags_s: float
     half_s: float
     merge_s: float
-    merge_pair_s: float = 0.0
     publish_s: float = 0.0
     notice_share: float = 0.0
+    crowd: float = 0.0
     news: float = 10.0
     database_share: float = 0.0
     answer_s: float = 0.02
 
     def __post_init__(self) -> None:
-        values = (self.receive_s, self.flags_s, self.half_s, self.merge_s, self.merge_pair_s, self.answer_s)
+        values = (self.receive_s, self.flags_s, self.half_s, self.merge_s, self.answer_s)
         if not all(0.0 <= one < 60.0 for one in values):
             raise OptionError(f"costs must be 0 to 60 s, got {', '.join(f'{one:g}' for one in values)}")
         if (1.0 - self.notice_share) * self.merge_s < self.publish_s:
             raise OptionError(f"a publication ({self.publish_s:g} s) is a part of a merge ({self.merge_s:g} s)")
-        shares = (self.database_share, self.notice_share)
+        shares = (self.database_share, self.notice_share, self.crowd)
         if not (all(0.0 <= one <= 1.0 for one in shares) and self.news > 0.0):
             raise OptionError(f"shares lie in [0, 1], news above 0; got {shares}, {self.news:g}")
+
+    def times(self, factor: float) -> "CpuCosts":
+        """All CPU times by a factor: those of another core."""
+        names = ("receive_s", "flags_s", "half_s", "merge_s", "publish_s")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +142,6 @@ class SimulatedRun:
         lags_s: of each report part that a version was made of, from its receipt to the publication.
         merges: how many tiles were merged.
         versions: how many of these changed the map.
-        merged_pairs: squared numbers of reports of their windows, summed over the merges.
         busy_s: CPU time.
         ended_s: when nothing waited any more, or the run was over.
         is_drained: whether nothing waited.
@@ -145,7 +151,6 @@ class SimulatedRun:
     lags_s: list[float] = field(default_factory=list)
     merges: int = 0
     versions: int = 0
-    merged_pairs: int = 0
     busy_s: float = 0.0
     ended_s: float = 0.0
     is_drained: bool = False
@@ -185,10 +190,15 @@ class CloudModel:
         costs: of each thing.
         rules: of host and shards.
         seed: of which merges change the map.
+        again: of a street, how many merges of what is known follow a merge of what has come: what was said of a vehicle
+            has changed, and tiles about which it reported are merged once more.
     """
 
-    def __init__(self, costs: CpuCosts, rules: HostRules, seed: int = 1) -> None:
-        self._costs, self._rules, self._rng = costs, rules, random.Random(seed)
+    def __init__(
+        self, costs: CpuCosts, rules: HostRules, seed: int = 1, again: Callable[[int], float] = lambda _: 0.0
+    ) -> None:
+        self._costs = costs.times(1.0 + costs.crowd * max(rules.shards / rules.cores - 1.0, 0.0))
+        self._rules, self._rng, self._again = rules, random.Random(seed), again
         self._env = simpy.Environment()
         self._cores = simpy.PriorityResource(self._env, rules.cores)
         self._database = simpy.PriorityResource(self._env, rules.database_cores) if rules.database_cores else None
@@ -201,6 +211,7 @@ class CloudModel:
         self._waiting = _WaitingTiles(self._dirty)
         self._own_waiting = [_WaitingTiles(self._dirty) for _ in range(rules.shards)]
         self._window: Counter[int] = Counter()  # reports of each tile's open window
+        self._known: dict[int, list[int]] = {}  # of each street, the tiles about which reports have come
         self._open = 0  # reports that are not through
         self.run_ = SimulatedRun()
 
@@ -279,6 +290,8 @@ class CloudModel:
             self._open -= 1
             return
         for tile, said in one.says:
+            if tile not in self._window:
+                self._known.setdefault(tile // STREET, []).append(tile)
             self._window[tile] = self._window[tile] % StoreConfig().window_reports + 1
             if said == "asked":
                 self._mark(tile, one.shard, came_s, HALVES_WAIT * delay_s, 1 << 30)
@@ -292,9 +305,17 @@ class CloudModel:
     def _mark(self, tile: int, shard: int, came_s: float, delay_s: float, merge_after: int) -> None:
         dirty = self._dirty.setdefault(tile, _Dirty(self._env.now + delay_s, shard))
         dirty.waiting.append(came_s)
+        self._wait(tile, dirty, delay_s, merge_after)
+
+    def _wait(self, tile: int, dirty: _Dirty, delay_s: float, merge_after: int) -> None:
         is_full = len(dirty.waiting) >= merge_after
         dirty.ready_s = min(dirty.ready_s, self._env.now + (0.0 if is_full else delay_s))
         self._note(tile, dirty)
+
+    def _merge_again(self, tile: int, shard: int) -> None:
+        if tile not in self._dirty:
+            delay_s = self._rules.merge_delay_s
+            self._wait(tile, self._dirty.setdefault(tile, _Dirty(self._env.now + delay_s, shard)), delay_s, 1 << 30)
 
     def _note(self, tile: int, dirty: _Dirty) -> None:
         if not dirty.is_leased:
@@ -315,10 +336,8 @@ class CloudModel:
                     dirty = self._dirty[tile]
                     read = self._window[tile]
                     taken.append((tile, len(dirty.waiting), read))
-                    self.run_.merged_pairs += read**2
-                    cost_s = self._costs.merge_s + self._costs.merge_pair_s * read**2
-                    after_s += self._costs.notice_share * cost_s
-                    own_s = (1.0 - self._costs.notice_share) * cost_s - self._costs.publish_s
+                    after_s += self._costs.notice_share * self._costs.merge_s
+                    own_s = (1.0 - self._costs.notice_share) * self._costs.merge_s - self._costs.publish_s
                     yield from self._use(self._workers[shard], own_s, _LATER)
                 if self._costs.publish_s:
                     with self._alone.request() as turn:
@@ -358,10 +377,12 @@ class CloudModel:
             self.run_.versions += 1
             self.run_.lags_s += [self._env.now - came_s for came_s in dirty.waiting[:count]]
         del dirty.waiting[:count]
-        if not dirty.waiting:
+        if dirty.waiting:
+            dirty.is_leased = False
+            is_full = len(dirty.waiting) >= self._rules.merge_after
+            dirty.ready_s = self._env.now + (0.0 if is_full else self._rules.merge_delay_s)
+            self._note(tile, dirty)
+        else:
             del self._dirty[tile]
-            return
-        dirty.is_leased = False
-        is_full = len(dirty.waiting) >= self._rules.merge_after
-        dirty.ready_s = self._env.now + (0.0 if is_full else self._rules.merge_delay_s)
-        self._note(tile, dirty)
+        if count and self._rng.random() < self._again(tile // STREET):
+            self._merge_again(self._rng.choice(self._known[tile // STREET]), dirty.shard)

@@ -1,6 +1,6 @@
 """`docs/scale.md`: tables from the committed measurements, the model and the prices."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
 from typing import Final
@@ -43,7 +43,7 @@ def page() -> str:
     fitted = fitted_stores(loads)
     told = [foretold(load, loads, fitted[kind]) for use in USES for kind in KINDS for load in loads.of(kind, use)]
     of_region = replace(fitted["postgresql"].costs, publish_s=figures[PUBLISHED].value / 4e3)
-    shape = ReportShape.of(figures)
+    shape = ReportShape.of(figures, loads.worker.again["settled"])
     use = costs_of_use(of_region, figures, light(of_region, shape))
     places = [planned(place, use, given) for place in given.place]
     values = {
@@ -61,8 +61,11 @@ def page() -> str:
         "million": _million(figures),
         "figures": _figures(figures),
         "machine": loads.machine,
-        "runs": f"{min(loads.runs(one.load) for one in told)} to {max(loads.runs(one.load) for one in told)}",
+        "runs": _ends([loads.runs(one.load) for one in told]),
         "given": _given(given),
+        "unit": f"{fitted['file'].unit_ms:.1f}",
+        "units": _ends([one.unit_ms for one in loads.loads]),
+        "again": " and ".join(f"{share:.2f} on {name} streets" for name, share in loads.worker.again.items()),
     }
     text = resources.files(__package__).joinpath("page.md").read_text(encoding="utf-8")
     for name, value in values.items():
@@ -83,6 +86,11 @@ def _two(value: float) -> str:
     return f"{rounded:,.0f}" if abs(rounded) >= 10 else f"{rounded:g}"
 
 
+def _ends(values: Sequence[float]) -> str:
+    least, most = min(values), max(values)
+    return f"{least:.3g}" if least == most else f"{least:.3g} to {most:.3g}"
+
+
 def _percent(share: float) -> str:
     return f"{100 * share:+.0f} %"
 
@@ -95,7 +103,7 @@ def _costs(fitted: Mapping[Kind, FittedStore]) -> str:
             ("flags, ms a tile", 1e3 * one.flags_s),
             ("second half, ms", 1e3 * one.half_s),
             ("merge of a tile, ms", 1e3 * one.merge_s),
-            ("more for n reports in its window, µs · n²", 1e6 * one.merge_pair_s),
+            ("more CPU for all, of each further worker on a core, %", 100 * one.crowd),
             ("of a merge after its publication, %", 100 * one.notice_share),
             ("of all in the database server, %", 100 * one.database_share),
             ("of n reports about a tile the next is news with 1 / (1 + n / …)", one.news),

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from studies.scale.model import CloudModel, CpuCosts, HostRules, Said, SimulatedReport, SimulatedRun
+from studies.scale.model import STREET, CloudModel, CpuCosts, HostRules, Said, SimulatedReport, SimulatedRun
 from studies.scale.plan import CostsOfUse, MeasuredFigure
 
 SIMULATED_S: Final = 40.0
@@ -20,15 +20,22 @@ STREETS: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class ReportShape:
-    """Reports of a vehicle that knows its street: tiles a report, and of these asked for Gaussians."""
+    """Reports of a vehicle that knows its street.
+
+    Attributes:
+        told: tiles a report.
+        asked: of these asked for Gaussians.
+        again: merges of what was known, for each merge of what has come.
+    """
 
     told: float
     asked: float
+    again: float = 0.0
 
     @classmethod
-    def of(cls, figures: Mapping[str, MeasuredFigure]) -> "ReportShape":
+    def of(cls, figures: Mapping[str, MeasuredFigure], again: float) -> "ReportShape":
         """As measured."""
-        return cls(figures["tiles_told_a_report"].value, figures["tiles_asked_a_report"].value)
+        return cls(figures["tiles_told_a_report"].value, figures["tiles_asked_a_report"].value, again)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +100,12 @@ def shards_of_region(use: CostsOfUse) -> int:
 def _run(costs: CpuCosts, shape: ReportShape, per_s: float, rules: HostRules, seed: int = 1) -> SimulatedRun:
     rng, at_s, reports = random.Random(seed), 0.0, list[SimulatedReport]()
     while (at_s := at_s + rng.expovariate(per_s)) < SIMULATED_S:
-        first = 1000 * rng.randrange(STREETS)
+        first = STREET * rng.randrange(STREETS)
         told = _drawn(shape.told, rng)
         asked = min(told, _drawn(shape.asked, rng))
         says: list[tuple[int, Said]] = [(first + n, "asked" if n < asked else "quiet") for n in range(told)]
-        reports.append(SimulatedReport(at_s, first // 1000 % rules.shards, tuple(says)))
-    return CloudModel(costs, rules, seed).run(reports, PATIENCE_S)
+        reports.append(SimulatedReport(at_s, first // STREET % rules.shards, tuple(says)))
+    return CloudModel(costs, rules, seed, lambda _: shape.again).run(reports, PATIENCE_S)
 
 
 def _drawn(mean: float, rng: random.Random) -> int:

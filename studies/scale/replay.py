@@ -36,6 +36,7 @@ from gnd.deploy.load.plan import Due, LoadOptions
 from gnd.deploy.load.sending import SendingMeasured
 from gnd.deploy.load.shift import DistrictShift, shifted_district
 from gnd.deploy.load.streets import Streets
+from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import change_key
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
@@ -74,6 +75,7 @@ class _Cloud:
         confirmation = replace(config.confirmation, copies=False)
         self._config = replace(config, ingest=IngestLimits(speeds=False), confirmation=confirmation)
         self._bases, self.told = Bases(self.store), list[ReportState]()
+        self._journaled = Counter[int]()  # of each tile, what was there when it was merged last
         self._ingest = Ingest(self.store, "replay", now_ns=self._now)
         self._expander = Expander(self.store, self._config, lambda _, state: self.told.append(state), bases=self._bases)
         self._worker = Worker(self.store, self._config, self._bases)
@@ -105,6 +107,7 @@ class _Cloud:
         with self._costs.of("merges"):
             claims = self.store.claim("replay", TILES_AT_ONCE, self._config.lease_s)
             self._worker.begin(claims)
+        self._costs.count["merges of what was known"] += sum(not self._is_news(one.tile) for one in claims)
         for some in in_turn(claims):
             before = self._marks()
             with self._costs.of("merges"):
@@ -114,6 +117,13 @@ class _Cloud:
             self._costs.count["versions"] += sum(one is not None and one.status == "published" for one in results)
         with self._costs.of("notices"):
             self._announce()
+
+    def _is_news(self, tile: TileId) -> bool:
+        """Whether something has come about a tile since it was merged."""
+        asked = "SELECT COUNT(*) FROM report WHERE layer = 'ndt' AND tile = ?"
+        ((parts,),) = self.store.look(lambda c: list(c.execute(asked, (tile.morton,))))  # type: ignore[attr-defined]
+        before, self._journaled[tile.morton] = self._journaled[tile.morton], int(parts)
+        return int(parts) > before
 
     def _marks(self) -> int:
         """Numbers that were given to reports and to marks in the journals; a publication gives them to marks alone."""

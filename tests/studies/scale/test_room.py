@@ -12,6 +12,7 @@ import pytest
 from studies.frame.errors import OptionError
 from studies.scale import room as room_module
 from studies.scale.room import GROUPS, room
+from studies.scale.yardstick import units_beside
 
 can_make_groups = pytest.mark.skipif(
     os.geteuid() != 0 or not os.access(GROUPS / "cpu.shares", os.W_OK), reason="control groups (version 1), as root"
@@ -45,6 +46,18 @@ def test_a_bounded_process_gets_no_more_than_its_share() -> None:
         took_s, used_s = time.monotonic() - began_s, psutil.Process(started.pid).cpu_times().user - before
         started.kill()
     assert 0.0 < used_s < 0.1 * took_s + 0.1
+
+
+@can_make_groups
+def test_units_of_the_yardstick_are_done_in_the_room_beside_the_work() -> None:
+    with room() as made, units_beside(made) as units:
+        begun_s = time.monotonic()
+        time.sleep(1.3)
+    assert units.mean_ms() > 0.0
+    assert units.mean_ms(begun_s, begun_s + 1.3) > 0.0
+    with pytest.raises(OptionError, match=r"no unit of work was done beside it in 1\.0 s"):
+        units.mean_ms(0.0, 1.0)
+    assert not made.group.exists()
 
 
 @can_make_groups

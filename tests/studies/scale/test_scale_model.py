@@ -60,6 +60,22 @@ def test_a_lonely_report_waits_for_the_merge_delay_and_its_own_work():
     assert (quiet.merges, quiet.is_drained) == (0, True)
 
 
+def test_what_was_known_is_merged_again_and_changes_nothing():
+    costs, reports = replace(NOTHING, merge_s=0.03, news=1e9), [SimulatedReport(0.0, 0, ((7, "plain"),))]
+    run = CloudModel(costs, HostRules(shards=1), again=lambda street: 1.0 - street).run(reports, 60.0)
+    assert (run.merges, run.versions, len(run.lags_s), run.is_drained) == (2, 1, 1, True)
+    other = [replace(reports[0], says=((1007, "plain"),))]  # of another street
+    assert CloudModel(costs, HostRules(shards=1), again=lambda street: 1.0 - street).run(other, 60.0).merges == 1
+
+
+def test_costs_of_a_core_that_is_worth_less():
+    costs = CpuCosts(0.001, 0.002, 0.003, 0.004, crowd=0.1, publish_s=0.001, notice_share=0.1, news=3.0)
+    slow = costs.times(1.5)
+    assert (slow.receive_s, slow.flags_s, slow.half_s) == pytest.approx((0.0015, 0.003, 0.0045))
+    assert (slow.merge_s, slow.publish_s) == pytest.approx((0.006, 0.0015))
+    assert (slow.notice_share, slow.crowd, slow.news, slow.answer_s) == (0.1, 0.1, 3.0, costs.answer_s)
+
+
 def test_beyond_saturation_more_reports_go_into_a_merge():
     costs = CpuCosts(receive_s=0.001, flags_s=0.002, half_s=0.0, merge_s=0.1, news=1e9)
     says = tuple((tile, "plain") for tile in range(8))
