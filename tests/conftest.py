@@ -11,7 +11,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 from postgres_fixtures import new_database, postgres
-from prepared import prepared
+from prepared import Prepared, prepared
 from suite_groups import (
     pytest_collection_modifyitems,
     pytest_configure_node,
@@ -19,6 +19,7 @@ from suite_groups import (
 )
 from suite_kernels import choose_kernels
 from suite_ports import new_port
+from unpacked import unpacked_once
 from web_fixtures import new_bucket, s3_server, served
 
 # Hooks and fixtures that pytest finds here.
@@ -56,10 +57,21 @@ def pytest_configure() -> None:
     Tests are of the source, compiled by numba; programs that they start run a library of it (`suite_kernels`). Those of
     tests/ahead are of libraries. GND_KERNELS=numba or FILE tests all on one.
     """
+    keep_bytecode()
     choose_kernels()
     gc.disable()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def keep_bytecode() -> None:
+    """Python keeps what it compiles, in this process and in those that it starts, also where PYTHONDONTWRITEBYTECODE
+    is set, as in most container images.
+
+    Else each tester compiles all tests anew, and each of the hundreds of programs that they start all of our modules.
+    """
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 
 
 def pytest_collection_finish() -> None:
@@ -96,11 +108,12 @@ def identity_as_before() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data(prepared: Prepared) -> Iterator[Path]:
     """The folder of real recordings; a test that needs it skips where it is missing."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real recordings not found at ../{SHARED_DATA.parent.name}/{SHARED_DATA.name}")
-    return SHARED_DATA
+    with unpacked_once(SHARED_DATA, prepared):
+        yield SHARED_DATA
 
 
 @pytest.fixture

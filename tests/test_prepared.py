@@ -1,5 +1,6 @@
 """What is prepared for several processes is made once, and whole."""
 
+import lzma
 import os
 import signal
 import subprocess
@@ -9,6 +10,10 @@ from pathlib import Path
 
 import pytest
 from prepared import made_once
+from unpacked import unpacked_once
+
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.files import read_file
 
 HERE = Path(__file__).parent
 PROGRAM = """
@@ -70,3 +75,21 @@ def test_who_fails_leaves_it_to_the_next(tmp_path: Path) -> None:
     assert not (tmp_path / "world").exists()
     whole = made_once(tmp_path, "world", lambda folder: folder.joinpath("whole.txt").touch())
     assert [path.name for path in whole.iterdir()] == ["whole.txt"]
+
+
+def test_a_file_of_a_recording_is_unpacked_once_and_others_as_ever(tmp_path: Path) -> None:
+    recording, other = tmp_path / "recordings" / "a" / "0.bin.xz", tmp_path / "other.bin.xz"
+    recording.parent.mkdir(parents=True)
+    recording.write_bytes(lzma.compress(b"a scan"))
+    other.write_bytes(lzma.compress(b"another"))
+    link = tmp_path / "link.bin.xz"
+    link.symlink_to(recording)
+    with unpacked_once(tmp_path / "recordings", lambda name, make: made_once(tmp_path / "prepared", name, make)):
+        assert (read_file(link), read_file(other)) == (b"a scan", b"another")
+        for path in (recording, other):
+            path.write_bytes(b"damaged, and no archive")
+        assert read_file(recording) == read_file(link) == b"a scan"
+        with pytest.raises(ImportDriveError, match="not xz"):
+            read_file(other)
+    with pytest.raises(ImportDriveError, match="not xz"):
+        read_file(recording)
