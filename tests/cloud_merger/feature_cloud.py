@@ -84,8 +84,15 @@ def change(
 
 
 def sha_of(features: Sequence[Feature], tile: TileId = TILE) -> bytes:
-    """The hash by which a report names its base."""
-    return FeatureTile.of(tile, 1, features).sha
+    """The hash by which a report names its base; thousands of reports in turn name the same."""
+    named = (tile, tuple(map(id, features)))
+    if named not in _LAST_SHA:
+        _LAST_SHA.clear()
+        _LAST_SHA[named] = (FeatureTile.of(tile, 1, features).sha, tuple(features))  # held: no id comes twice
+    return _LAST_SHA[named][0]
+
+
+_LAST_SHA: dict[tuple[TileId, tuple[int, ...]], tuple[bytes, tuple[Feature, ...]]] = {}
 
 
 def report_id(number: int) -> str:

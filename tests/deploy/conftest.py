@@ -42,6 +42,15 @@ def make_small_world(folder: Path) -> None:
         simulate_drive(world, config, folder / f"{config.vehicle}.mcap")
 
 
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory, small_world: SmallWorld) -> Path:
+    """The folder of a whole run of both drives that has ended by itself; tests copy what they change."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    drives = [word for drive in small_world.drives for word in ("--drives", str(drive))]
+    Run(folder, *drives, "--map", str(small_world.base_map), "--link", "4g", timeout_s=900).finish()
+    return folder
+
+
 @pytest.fixture
 def start_run(tmp_path: Path, small_world: SmallWorld) -> Iterator[Callable[..., Run]]:
     runs: list[Run] = []

@@ -34,14 +34,14 @@ def report_parts(folder: Path) -> list[tuple[int, str, int]]:
         return [(row.tile.morton, row.report_id, row.part) for row in store.reports()]
 
 
-def assert_nothing_lost_or_doubled(run: Run, summary: dict[str, object]) -> None:
+def assert_nothing_lost_or_doubled(folder: Path, summary: dict[str, object]) -> None:
     assert summary["reports_lost"] == 0
     assert summary["reports_sent"] == summary["reports_acknowledged"]
     assert int(str(summary["reports_sent"])) > 0
-    rows = report_parts(run.folder)
+    rows = report_parts(folder)
     assert len(rows) == len(set(rows))
-    with SqliteStore(run.folder / "store.sqlite") as store:
-        assert lost_reports(RunFolder(run.folder), store) == []
+    with SqliteStore(folder / "store.sqlite") as store:
+        assert lost_reports(RunFolder(folder), store) == []
         assert store.dirty_count() == 0
         assert store.quarantined() == []
         for history in tile_histories(store):
@@ -49,20 +49,19 @@ def assert_nothing_lost_or_doubled(run: Run, summary: dict[str, object]) -> None
             assert versions == sorted(set(versions))
 
 
-def test_a_run_ends_by_itself_with_a_full_account(start_run: Start) -> None:
-    run = start_run("--link", "none")
-    summary = run.finish()
-    assert_nothing_lost_or_doubled(run, summary)
+def test_a_run_ends_by_itself_with_a_full_account(finished_run: Path) -> None:
+    summary = json.loads((finished_run / "summary.json").read_text())
+    assert_nothing_lost_or_doubled(finished_run, summary)
     assert summary["updates_received"] >= summary["tiles_published"] > 0
     assert summary["changed_voxels"] > 0
     assert summary["traffic"]["down_wire_bytes"] > summary["traffic"]["down_bytes"] > 0
-    assert_one_account(run.folder, summary["traffic"])
-    results = [json.loads(path.read_text())["traffic"] for path in run.folder.glob("agents/*/result.json")]
+    assert_one_account(finished_run, summary["traffic"])
+    results = [json.loads(path.read_text())["traffic"] for path in finished_run.glob("agents/*/result.json")]
     for name in ("up_bytes", "down_bytes", "up_wire_bytes", "down_wire_bytes"):
         assert summary["traffic"][name] == sum(result[name] for result in results), "what the vehicles say themselves"
     assert summary["localisation_p95"]["lateral_m"] is not None
     assert summary["restarts"] == {}
-    lines = [json.loads(line) for line in (run.folder / "updates.jsonl").read_text().splitlines()]
+    lines = [json.loads(line) for line in (finished_run / "updates.jsonl").read_text().splitlines()]
     assert len({(line["tile"], line["version"]) for line in lines}) == len(lines)
 
 
@@ -74,7 +73,7 @@ def test_kill_9_in_mid_run_loses_nothing_and_applies_nothing_twice(start_run: St
     run.wait_for(lambda: run.pid(victim) != pid, f"{victim} is started again")
     summary = run.finish()
     assert summary["restarts"] == {victim: 1}
-    assert_nothing_lost_or_doubled(run, summary)
+    assert_nothing_lost_or_doubled(run.folder, summary)
 
 
 def test_every_process_of_the_cloud_killed_in_turn(start_run: Start) -> None:
@@ -83,7 +82,7 @@ def test_every_process_of_the_cloud_killed_in_turn(start_run: Start) -> None:
     for victim in ("merger-1", "store", "merger-0", "router"):
         pid = run.kill(victim)
         run.wait_for(lambda victim=victim, pid=pid: run.pid(victim) != pid, f"{victim} is started again")  # type: ignore[misc]
-    assert_nothing_lost_or_doubled(run, run.finish())
+    assert_nothing_lost_or_doubled(run.folder, run.finish())
 
 
 def test_ctrl_c_ends_every_process_in_order(start_run: Start) -> None:
@@ -102,7 +101,7 @@ def test_ctrl_c_ends_every_process_in_order(start_run: Start) -> None:
 def test_vehicles_start_one_after_the_other_in_the_time_of_their_drives(start_run: Start) -> None:
     run = start_run("--link", "none", "--headway", "3")
     summary = run.finish()
-    assert_nothing_lost_or_doubled(run, summary)
+    assert_nothing_lost_or_doubled(run.folder, summary)
     ways = read_ways(RunFolder(run.folder))
     assert list(ways) == ["vehicle-00", "vehicle-01"]
     ahead, behind = ways.values()

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from conftest import SEED, SmallWorld
-from fleet_testing import Run
+from conftest import SEED
 from html_reader import Reader
 
 from gnd.deploy.errors import PageError, ReportError
@@ -37,15 +36,6 @@ EVIL = "<img src=x onerror=alert(1)>&\"'"
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory, small_world: SmallWorld) -> Path:
-    """A run of recorded drives that has ended."""
-    folder = tmp_path_factory.mktemp("report") / "run"
-    drives = [word for drive in small_world.drives for word in ("--drives", str(drive))]
-    Run(folder, *drives, "--map", str(small_world.base_map), "--link", "4g", timeout_s=900).finish()
-    return folder
-
-
-@pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The truth of the street that was driven, scanned coarsely."""
     path = tmp_path_factory.mktemp("truth") / "truth.npz"
@@ -54,9 +44,9 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(finished: Path, tmp_path: Path) -> Path:
+def copy(finished_run: Path, tmp_path: Path) -> Path:
     """A copy that a test may damage."""
-    return Path(shutil.copytree(finished, tmp_path / "run"))
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def invoke(*arguments: object) -> str:
@@ -69,11 +59,11 @@ def pictures_of(text: str) -> list[bytes]:
     return [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', text)]
 
 
-def test_a_run_of_recorded_drives_is_told_without_truth(finished: Path) -> None:
-    run = read_finished_run(finished)
+def test_a_run_of_recorded_drives_is_told_without_truth(finished_run: Path) -> None:
+    run = read_finished_run(finished_run)
     text = report_page(run, pictures=3)
     words = Reader(text).words
-    summary = json.loads((finished / "summary.json").read_text())
+    summary = json.loads((finished_run / "summary.json").read_text())
     assert run.missing == ()
     assert run.truth is None
     assert "There is no truth" in words
@@ -103,22 +93,22 @@ def test_what_is_a_command_in_the_summary_looks_like_one(copy: Path) -> None:
     assert "`" not in said
 
 
-def test_the_operators_room_shows_the_vehicles_of_a_finished_run(finished: Path) -> None:
-    by_vehicle = json.loads((finished / "summary.json").read_text())["traffic"]["by_vehicle"]
-    told = json.loads(CliRunner().invoke(status, [str(finished), "--json"], catch_exceptions=False).stdout)
+def test_the_operators_room_shows_the_vehicles_of_a_finished_run(finished_run: Path) -> None:
+    by_vehicle = json.loads((finished_run / "summary.json").read_text())["traffic"]["by_vehicle"]
+    told = json.loads(CliRunner().invoke(status, [str(finished_run), "--json"], catch_exceptions=False).stdout)
     driven = {one["vehicle"]: one["drive_km"] for one in told["vehicles"]}
     assert driven == pytest.approx({name: own["drive_km"] for name, own in by_vehicle.items()}, abs=1e-3)
     assert (told["parts_waiting"], told["alerts"]) == (0, []), "a run that has ended misses no shard"
-    screen = CliRunner().invoke(status, [str(finished)], catch_exceptions=False).stdout
+    screen = CliRunner().invoke(status, [str(finished_run)], catch_exceptions=False).stdout
     for name, own in by_vehicle.items():
         (line,) = (line for line in screen.splitlines() if line.startswith(name))
         assert f"{size_text(own['down_wire_bytes'])}" in line
         assert f"{size_text(own['up_wire_bytes'])}" in line
-    assert CliRunner().invoke(status, [str(finished), "--check"]).exit_code == 0
+    assert CliRunner().invoke(status, [str(finished_run), "--check"]).exit_code == 0
 
 
-def test_the_list_holds_the_changes_of_the_map(finished: Path) -> None:
-    run = read_finished_run(finished)
+def test_the_list_holds_the_changes_of_the_map(finished_run: Path) -> None:
+    run = read_finished_run(finished_run)
     assert run.changes is not None
     assert run.changes.changes
     listed = sum(one.voxels for one in run.changes.changes) + run.changes.alone
@@ -156,8 +146,8 @@ def _size(png: bytes) -> tuple[int, int]:
     return struct.unpack(">II", png[16:24])  # type: ignore[return-value]
 
 
-def test_nothing_comes_from_elsewhere_and_nothing_runs(finished: Path) -> None:
-    text = report_page(read_finished_run(finished), pictures=1)
+def test_nothing_comes_from_elsewhere_and_nothing_runs(finished_run: Path) -> None:
+    text = report_page(read_finished_run(finished_run), pictures=1)
     read = Reader(text)
     assert not {"script", "link", "iframe", "object", "embed", "use", "image", "base", "form"} & {
         t for t, _ in read.tags
@@ -174,8 +164,8 @@ def test_nothing_comes_from_elsewhere_and_nothing_runs(finished: Path) -> None:
     assert all(a.get("alt") for t, a in read.tags if t == "img")
 
 
-def test_names_cannot_become_markup(finished: Path, tmp_path: Path) -> None:
-    run = Path(shutil.copytree(finished, tmp_path / EVIL.replace("/", "")))
+def test_names_cannot_become_markup(finished_run: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(finished_run, tmp_path / EVIL.replace("/", "")))
     mark = json.loads((run / "run.json").read_text())
     mark |= {"drives": [f"{EVIL}.mcap"], "map": f"$(rm -rf {EVIL})", "software": {EVIL: EVIL}, "groups": EVIL}
     (run / "run.json").write_text(json.dumps(mark))
@@ -301,8 +291,10 @@ document.title = [document.documentElement.scrollWidth, innerWidth,
 
 @needs_browser
 @pytest.mark.parametrize("width", [390, 1200])
-def test_a_browser_shows_every_picture_without_scrolling_sideways(finished: Path, tmp_path: Path, width: int) -> None:
-    text = report_page(read_finished_run(finished), pictures=2)
+def test_a_browser_shows_every_picture_without_scrolling_sideways(
+    finished_run: Path, tmp_path: Path, width: int
+) -> None:
+    text = report_page(read_finished_run(finished_run), pictures=2)
     (tmp_path / "r.html").write_text(text + MEASURE)
     frame = f'<body style="margin:0"><iframe src="r.html" style="border:0;width:{width}px;height:3000px"></iframe>'
     wait = "<script>onload = () => {document.title = frames[0].document.title}</script>"

@@ -13,8 +13,6 @@ import numpy as np
 
 from gnd.cloud_merger.announce import encoded, update_of
 from gnd.fleet_bus.bus import Bus
-from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from gnd.fleet_sim.street import StreetOptions, street
 from gnd.gnd_map.codec import LATTICES, snap
 from gnd.gnd_map.content import AnyTile
 from gnd.gnd_map.features import Feature, FeatureTile, hit
@@ -22,7 +20,6 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import update_key
-from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,16 +98,3 @@ class Program:
         code = self.process.wait(60)
         self._reader.join(10)
         return code
-
-
-SCANS = 40
-
-
-def make_street(folder: Path) -> tuple[Path, Path]:
-    """(drive, map): 100 m of a street as it was, and a drive through it after it changed."""
-    world = street(5, StreetOptions(length_m=100.0))
-    mapping = DriveConfig("mapper", "VLP-16", "before", errors=PERFECT, car_share=0.0, cruise_mps=14.0, scans=45)
-    with SqliteStore(folder / "street.sqlite") as store:
-        build_map([simulate_drive(world, mapping, folder / "mapping.mcap")], store)
-    config = DriveConfig("car", "VLP-16", "after", seed=3, scans=SCANS)
-    return simulate_drive(world, config, folder / "drive.mcap"), folder / "street.sqlite"

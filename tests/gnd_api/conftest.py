@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from api_testing import EAST, FAR, HERE, Cloud, Program, gaussian_tile, make_street, sign_tile
+from api_testing import EAST, FAR, HERE, Cloud, Program, gaussian_tile, sign_tile
+from changed_street import changed_street
+from prepared import Prepared
 
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -48,6 +50,6 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
 
 
 @pytest.fixture(scope="session")
-def street_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def street_files(prepared: Prepared) -> tuple[Path, Path]:
     """A drive and the map of its street."""
-    return make_street(tmp_path_factory.mktemp("street"))
+    return changed_street(prepared)

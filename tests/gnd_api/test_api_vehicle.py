@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from api_testing import EAST, HERE, SCANS, Cloud, Program, sign_tile
+from api_testing import EAST, HERE, Cloud, Program, sign_tile
+from changed_street import SCANS
 
 import gnd
 from gnd.fleet_bus.errors import RequestFailed

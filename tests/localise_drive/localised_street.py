@@ -1,4 +1,4 @@
-"""A short street: a map of it in a store, a drive along it after it changed, drives that something is wrong with."""
+"""What the command makes of a drive along a short street that has changed, and drives that something is wrong with."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,16 +8,9 @@ from typing import Any
 from click.testing import CliRunner, Result
 
 from gnd.deploy.cli import gnd
-from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from gnd.fleet_sim.street import StreetOptions, street
 from gnd.gnd_map.errors import GndError
 from gnd.schemas.drive import DriveItem, GnssFix
 from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
-from gnd.tile_store.build import build_map
-from gnd.tile_store.sqlite_store import SqliteStore
-
-SCANS = 40
-MAPPED = 45
 
 
 @dataclass(frozen=True)
@@ -29,16 +22,6 @@ class Ran:
     out: Path
     stdout: str
     summary: dict[str, Any]
-
-
-def make_street(folder: Path) -> tuple[Path, Path]:
-    """(drive, store): the map is the street before, the drive goes through it after."""
-    world = street(5, StreetOptions(length_m=100.0))
-    mapping = DriveConfig("mapper", "VLP-16", "before", errors=PERFECT, car_share=0.0, cruise_mps=14.0, scans=MAPPED)
-    with SqliteStore(folder / "base.sqlite") as store:
-        build_map([simulate_drive(world, mapping, folder / "mapping.mcap")], store)
-    config = DriveConfig("car", "VLP-16", "after", seed=3, scans=SCANS)
-    return simulate_drive(world, config, folder / "drive.mcap"), folder / "base.sqlite"
 
 
 def changed(source: Path, target: Path, change: Callable[[DriveItem], DriveItem | None]) -> Path:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from localised_street import SCANS, Ran, changed, localise, moved_north, refusal
+from changed_street import SCANS
+from localised_street import Ran, changed, localise, moved_north, refusal
 from mcap.reader import make_reader
 
 from gnd.deploy.cli import gnd
