@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters, gate_of
 from gnd.cloud_merger.features.rls import PlaceEstimate
@@ -44,6 +43,8 @@ def pairs(
     possible = np.isfinite(cost)
     if not possible.any():
         return []
+    from scipy.optimize import linear_sum_assignment  # here because the import is dear, and few shards merge features
+
     alone = np.full((len(measured), len(measured)), cost[possible].max() + gate_of(3))
     rows, columns = linear_sum_assignment(np.hstack([np.where(possible, cost, _NEVER), alone]))
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if j < len(known) and possible[i, j]]

@@ -7,14 +7,11 @@ shard that is killed leaves nothing half done: what it has published is a versio
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from gnd.cloud_merger.survey.drives import SurveyedDrive, drives_of, first_poses
-from gnd.cloud_merger.survey.fuse import FusedTile, fuse_piece
-from gnd.cloud_merger.survey.solve import SolvedPiece, solve_piece
-from gnd.cloud_merger.survey.verdict import verdict
 from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.codec import LATTICES, best_codec, codec_of, snap
 from gnd.gnd_map.errors import GndError
@@ -29,6 +26,10 @@ from gnd.tile_store.errors import DistrictElsewhere, StoreError
 from gnd.tile_store.roads import OpenRoads, RoadTile
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_CODEC, lattice_named
+
+if TYPE_CHECKING:  # here, and where a road is mapped: GTSAM takes 40 MB, and most shards are sent no surveys
+    from gnd.cloud_merger.survey.fuse import FusedTile
+    from gnd.cloud_merger.survey.solve import SolvedPiece
 
 QUIET_S: Final = 2.0
 """Parts are waited for until none has come for so long ..."""
@@ -129,6 +130,9 @@ class RoadMapper:
             return RoadsMapped(failed=1)
 
     def _map_piece(self, layer: str, drives: Sequence[SurveyedDrive]) -> RoadsMapped:
+        from gnd.cloud_merger.survey.fuse import fuse_piece
+        from gnd.cloud_merger.survey.solve import solve_piece
+
         frame = frame_of(drives[0])
         if frame is None:
             return RoadsMapped()
@@ -166,13 +170,15 @@ class RoadMapper:
     def _write(
         self,
         layer: str,
-        one: FusedTile,
-        piece: SolvedPiece,
+        one: "FusedTile",
+        piece: "SolvedPiece",
         before: Mapping[TileId, Tile],
         heads: Mapping[TileId, int],
         known: RoadTile | None,
     ) -> RoadsMapped:
         """Write what a tile has become; publish it where it is good."""
+        from gnd.cloud_merger.survey.verdict import verdict
+
         state, reason = verdict(one, _told(piece))
         new = one.gaussians.take(one.agreed) if state == "published" else one.gaussians
         new = snap(new, self._lattice) if len(new) else new
@@ -209,7 +215,7 @@ def _joined(before: Tile | None, new: Gaussians) -> Gaussians:
     return concat([held, new.take(~are_in(new.voxel_id, held.voxel_id))])
 
 
-def _told(piece: SolvedPiece) -> str:
+def _told(piece: "SolvedPiece") -> str:
     return "; ".join(f"{piece.drives[k].vehicle} does not count: {why}" for k, why in sorted(piece.doubts.items()))
 
 

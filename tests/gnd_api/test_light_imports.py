@@ -44,6 +44,10 @@ def test_each_command_but_those_that_compute_loads_nothing_heavy() -> None:
     assert loaded_by("; ".join(f"import gnd.deploy.{name}" for name in light)).isdisjoint(HEAVY)
 
 
+def test_a_shard_loads_gtsam_when_it_maps_a_road_and_not_before() -> None:
+    assert "gtsam" not in loaded_by("import gnd.cloud_merger.merger")
+
+
 def test_a_kernel_loads_numba_when_it_is_called_and_not_before() -> None:
     imports = "import numpy as np; from gnd.gnd_map.codec import decode_tiles, encode_tiles"
     assert "numba" not in loaded_by(imports)

@@ -237,7 +237,7 @@ def test_a_piece_that_fails_does_not_stop_the_others(store: SqliteStore, monkeyp
             raise RuntimeError("Indeterminant linear system")
         return solve_piece(drives, tiles, frame)
 
-    monkeypatch.setattr("gnd.cloud_merger.survey.mapper.solve_piece", failing)
+    monkeypatch.setattr("gnd.cloud_merger.survey.solve.solve_piece", failing)
     made = RoadMapper(store, "m1").map_now("ndt")
     assert (made.pieces, made.failed) == (2, 1)
     assert made.draft > 2
