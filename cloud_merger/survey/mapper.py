@@ -27,7 +27,7 @@ from gnd.tile_store.roads import OpenRoads, RoadTile
 from gnd.tile_store.sqlite_store import SqlStore
 from gnd.tile_store.values import DEFAULT_CODEC, lattice_named
 
-if TYPE_CHECKING:  # here, and where a road is mapped: GTSAM takes 40 MB, and most shards are sent no surveys
+if TYPE_CHECKING:  # and where a road is mapped: GTSAM is dear to load, and most shards are sent no surveys
     from gnd.cloud_merger.survey.fuse import FusedTile
     from gnd.cloud_merger.survey.solve import SolvedPiece
 
