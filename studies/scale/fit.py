@@ -18,7 +18,6 @@ SEEDS: Final = (1, 2, 3)
 """Of which tiles are asked for; figures are medians over them."""
 ROUNDS: Final = 6
 """How often costs are taken anew from the merges that the model makes with them; they hardly change after the first."""
-CROWDS: Final = (0.0,)
 NOTICE_SHARES: Final = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 QUANTILES: Final = {"p50": 0.5, "p95": 0.95}
 
@@ -32,12 +31,14 @@ class FittedStore:
         asked: of tiles with changes the share that is asked for, by edition of the street.
         again: for each merge of what has come, the merges of what was known, likewise.
         unit_ms: CPU.
+        beside: what flags and second halves take, to what they take alone.
     """
 
     costs: CpuCosts
     asked: Mapping[str, float]
     again: Mapping[str, float]
     unit_ms: float
+    beside: float = 1.0
 
     def costs_beside(self, unit_ms: float) -> CpuCosts:
         """On a core that is worth as much as it was in a load."""
@@ -130,10 +131,10 @@ def fitted_stores(loads: Loads) -> dict[Kind, FittedStore]:
     """Costs of each kind of store, from the loads to fit on and what other commands measure.
 
     Workers and receivers do the same whatever the store is, and use nearly the same CPU, so their loads are taken
-    together. What workers use beyond flags and second halves are the merges, and a little that each uses all the time,
-    by least squares over the loads; how many merges there are is the model's own count. The crowd is the one with which
-    these are missed least. How much of a merge comes after its publication is what brings the median lag of these loads nearest. A
-    database adds its own CPU, to each cost the same share.
+    together. Three things are found from what workers have used, by least squares: how much more flags and second
+    halves take beside all else than alone, what a merge takes, and what a worker takes once. How many merges there are
+    is the model's own count. How much of a merge comes after its publication is what brings the median lag of these
+    loads nearest. A database adds its own CPU, to each cost the same share.
 
     Raises:
         OptionError: there are too few loads.
@@ -143,9 +144,11 @@ def fitted_stores(loads: Loads) -> dict[Kind, FittedStore]:
         raise OptionError(f"{len(known)} loads to fit on; it takes 2")
     asked = {name: _asked(name, known, loads) for name in ("settled", "changed")}
     unit_ms = float(np.median([one.unit_ms for one in loads.loads]))
-    found = FittedStore(_first_guess(loads.worker, unit_ms), asked, loads.worker.again, unit_ms)
+    alone = _alone(loads.worker, unit_ms)
+    found = FittedStore(alone, asked, loads.worker.again, unit_ms)
     for _ in range(ROUNDS):
-        found = replace(found, costs=_refined(found, known, loads))
+        costs, beside = _refined(found, alone, known, loads)
+        found = replace(found, costs=costs, beside=beside)
     tried = [replace(found, costs=replace(found.costs, notice_share=share)) for share in NOTICE_SHARES]
     of_file = [one for one in known if one.store == "file"]
     best = min(tried, key=lambda one: sum(foretold(it, loads, one).errors()["lag p50"] ** 2 for it in of_file))
@@ -179,40 +182,37 @@ def _asked(edition: str, known: list[MeasuredLoad], loads: Loads) -> float:
     return min(1.0, sum(one.tiles_asked for one in some) / tiles)
 
 
-def _first_guess(worker: WorkerCosts, unit_ms: float) -> CpuCosts:
+def _alone(worker: WorkerCosts, unit_ms: float) -> CpuCosts:
+    """What is measured without a bus, on a core of which a unit of the yardstick takes so much; the rest is a guess."""
     scale_s = 1e-3 * unit_ms / worker.unit_ms
     return CpuCosts(0.005, scale_s * worker.flags_ms_a_tile, scale_s * worker.half_ms, 0.01)
 
 
-def _refined(before: FittedStore, known: list[MeasuredLoad], loads: Loads) -> CpuCosts:
-    """Costs of uploads and merges, from what other parts and the workers have used and the merges that the model counts."""
-    rows, versions = [], [0.0, 0.0]
+def _refined(before: FittedStore, alone: CpuCosts, known: list[MeasuredLoad], loads: Loads) -> tuple[CpuCosts, float]:
+    """Costs of uploads, from what the other parts have used; of what workers do, from what they have used, what they do
+    alone, and the merges that the model counts. And how much more flags and second halves take than alone.
+    """
+    rows, used_s, others_s, versions = [], [], 0.0, [0.0, 0.0]
     for load in known:
         runs = [simulated(load, loads, before, seed) for seed in SEEDS]
-        rows.append([float(np.median([run.merges for run in runs])), load.setting.shards * load.drained_s])
+        alone_s = load.tiles_told * alone.flags_s + load.halves * alone.half_s
+        rows.append((alone_s, float(np.median([run.merges for run in runs])), load.setting.shards))
+        worth = before.unit_ms / load.unit_ms
+        used_s.append(worth * load.cpu_s["workers"])
+        others_s += worth * (
+            load.client_cpu_s + sum(load.cpu_s.get(part, 0.0) for part in ("router", "store", "shards"))
+        )
         versions[0] += load.versions
         versions[1] += float(np.median([run.versions for run in runs]))
-    spent_s = np.array([one.tiles_told * before.costs.flags_s + one.halves * before.costs.half_s for one in known])
-    worth = before.unit_ms / np.array([one.unit_ms for one in known])
-    used_s, others_s = (worth * np.array([part(one) for one in known]) for part in (_used_by_workers, _used_by_others))
-    weight = 1.0 / used_s  # a load with little to do says as much as one with much
-    further = np.array([one.setting.shards for one in known]) - 1.0
-
-    def solved(crowd: float) -> tuple[float, float, float]:
-        """How far the loads are missed with a crowd, the cost of a merge, and the crowd."""
-        left_s = used_s / (1.0 + crowd * further) - spent_s
-        (merge_s, _beside), missed = nnls(np.array(rows) * weight[:, None], left_s * weight)
-        return missed, merge_s, crowd
-
-    _, merge_s, crowd = min(solved(one) for one in CROWDS)
-    received_s = float(np.sum(others_s / (1.0 + crowd * further))) / sum(one.reports + one.halves for one in known)
-    news = before.costs.news * (versions[0] / versions[1]) ** 2
-    return replace(before.costs, receive_s=received_s, merge_s=merge_s, crowd=crowd, news=news)
-
-
-def _used_by_workers(load: MeasuredLoad) -> float:
-    return load.cpu_s["workers"]
-
-
-def _used_by_others(load: MeasuredLoad) -> float:
-    return load.client_cpu_s + sum(load.cpu_s.get(part, 0.0) for part in ("router", "store", "shards"))
+    weight = np.array(used_s) ** -0.5  # a load with little to do says less than one with much
+    (beside, merge_s, begin_s), _ = nnls(np.array(rows) * weight[:, None], np.array(used_s) * weight)
+    costs = replace(
+        before.costs,
+        receive_s=others_s / sum(one.reports + one.halves for one in known),
+        flags_s=float(beside) * alone.flags_s,
+        half_s=float(beside) * alone.half_s,
+        merge_s=float(merge_s),
+        begin_s=float(begin_s),
+        news=before.costs.news * (versions[0] / versions[1]) ** 2,
+    )
+    return costs, float(beside)

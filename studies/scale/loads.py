@@ -96,6 +96,11 @@ class MeasuredLoad:
         return self.reports / self.drained_s
 
     @property
+    def core_share(self) -> float:
+        """CPU of the cloud and its clients that the reports took, to the time in which they were sent."""
+        return (self.cloud_cpu_s + self.client_cpu_s) / self.offered_s
+
+    @property
     def cloud_cpu_s(self) -> float:
         """Of all parts of the cloud."""
         return sum(self.cpu_s.values())

@@ -42,7 +42,7 @@ from studies.short_corpus import corpus
 from studies.speed.__main__ import machine
 
 SETTINGS: Final = (
-    # To fit the costs on: on one hardly anything is done, two leave the core idle, two offer more than it can do, and in
+    # To fit the costs on: on one hardly anything is done, two leave the core idle, two offer more than it can do, in
     # one more workers share it ...
     LoadSetting("fit", vehicles=1, changed_share=1.0, kmh=15.0, km=0.2),
     LoadSetting("fit", vehicles=8, changed_share=0.0, km=0.8),

@@ -42,7 +42,7 @@ class CpuCosts:
         merge_s: a tile, with its publication and notice.
         publish_s: of `merge_s`, for how long a publication has the database alone.
         notice_share: of a merge, what comes after the publication: notices, leases, looking for what is next.
-        crowd: of each shard beyond the first on a core, so much more CPU for all: more processes share its caches.
+        begin_s: what a worker takes once, when its first report comes.
         news: of reports about a tile of which n are known, 1 / (1 + n / news) change it: what is told often is no news.
         database_share: of each, what the database server does.
         answer_s: time (no CPU of the cloud) in which a vehicle answers with its second half.
@@ -54,24 +54,24 @@ class CpuCosts:
     merge_s: float
     publish_s: float = 0.0
     notice_share: float = 0.0
-    crowd: float = 0.0
+    begin_s: float = 0.0
     news: float = 10.0
     database_share: float = 0.0
     answer_s: float = 0.02
 
     def __post_init__(self) -> None:
-        values = (self.receive_s, self.flags_s, self.half_s, self.merge_s, self.answer_s)
+        values = (self.receive_s, self.flags_s, self.half_s, self.merge_s, self.begin_s, self.answer_s)
         if not all(0.0 <= one < 60.0 for one in values):
             raise OptionError(f"costs must be 0 to 60 s, got {', '.join(f'{one:g}' for one in values)}")
         if (1.0 - self.notice_share) * self.merge_s < self.publish_s:
             raise OptionError(f"a publication ({self.publish_s:g} s) is a part of a merge ({self.merge_s:g} s)")
-        shares = (self.database_share, self.notice_share, self.crowd)
+        shares = (self.database_share, self.notice_share)
         if not (all(0.0 <= one <= 1.0 for one in shares) and self.news > 0.0):
             raise OptionError(f"shares lie in [0, 1], news above 0; got {shares}, {self.news:g}")
 
     def times(self, factor: float) -> "CpuCosts":
         """All CPU times by a factor: those of another core."""
-        names = ("receive_s", "flags_s", "half_s", "merge_s", "publish_s")
+        names = ("receive_s", "flags_s", "half_s", "merge_s", "publish_s", "begin_s")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 
 
@@ -197,8 +197,7 @@ class CloudModel:
     def __init__(
         self, costs: CpuCosts, rules: HostRules, seed: int = 1, again: Callable[[int], float] = lambda _: 0.0
     ) -> None:
-        self._costs = costs.times(1.0 + costs.crowd * max(rules.shards / rules.cores - 1.0, 0.0))
-        self._rules, self._rng, self._again = rules, random.Random(seed), again
+        self._costs, self._rules, self._rng, self._again = costs, rules, random.Random(seed), again
         self._env = simpy.Environment()
         self._cores = simpy.PriorityResource(self._env, rules.cores)
         self._database = simpy.PriorityResource(self._env, rules.database_cores) if rules.database_cores else None
@@ -213,6 +212,7 @@ class CloudModel:
         self._window: Counter[int] = Counter()  # reports of each tile's open window
         self._known: dict[int, list[int]] = {}  # of each street, the tiles about which reports have come
         self._open = 0  # reports that are not through
+        self._begun = [False] * rules.shards
         self.run_ = SimulatedRun()
 
     def run(self, reports: Iterable[SimulatedReport], until_s: float) -> SimulatedRun:
@@ -276,6 +276,9 @@ class CloudModel:
         while True:
             claimed = [uploads.popleft() for _ in range(min(UPLOADS_AT_ONCE, len(uploads)))]
             for one, came_s, is_half in claimed:
+                if not self._begun[shard]:
+                    self._begun[shard] = True
+                    yield from self._use(self._workers[shard], self._costs.begin_s, _LATER)
                 cost_s = self._costs.half_s if is_half else self._costs.flags_s * len(one.says)
                 yield from self._use(self._workers[shard], cost_s, _LATER)
                 self._journaled(one, came_s, is_half=is_half)

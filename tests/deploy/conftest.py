@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from fleet_testing import Run
+from fleet_testing import SEED, Run
 from prepared import Prepared
 
 from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
@@ -15,7 +15,6 @@ from gnd.fleet_sim.street import street
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
 
-SEED = 11
 SCANS = 70
 
 

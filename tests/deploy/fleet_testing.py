@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 RUN_TIMEOUT_S = 240
+SEED = 11
+"""Of the street of `small_world`."""
 
 
 class Run:

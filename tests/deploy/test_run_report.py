@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from conftest import SEED
+from fleet_testing import SEED
 from html_reader import Reader
 
 from gnd.deploy.errors import PageError, ReportError

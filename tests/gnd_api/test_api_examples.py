@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from api_testing import HERE, ROOT, SCANS, Cloud, Program, gaussian_tile
+from api_testing import HERE, ROOT, Cloud, Program, gaussian_tile
+from changed_street import SCANS
 
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 

@@ -69,11 +69,11 @@ def test_what_was_known_is_merged_again_and_changes_nothing():
 
 
 def test_costs_of_a_core_that_is_worth_less():
-    costs = CpuCosts(0.001, 0.002, 0.003, 0.004, crowd=0.1, publish_s=0.001, notice_share=0.1, news=3.0)
+    costs = CpuCosts(0.001, 0.002, 0.003, 0.004, begin_s=0.1, publish_s=0.001, notice_share=0.1, news=3.0)
     slow = costs.times(1.5)
     assert (slow.receive_s, slow.flags_s, slow.half_s) == pytest.approx((0.0015, 0.003, 0.0045))
-    assert (slow.merge_s, slow.publish_s) == pytest.approx((0.006, 0.0015))
-    assert (slow.notice_share, slow.crowd, slow.news, slow.answer_s) == (0.1, 0.1, 3.0, costs.answer_s)
+    assert (slow.merge_s, slow.publish_s, slow.begin_s) == pytest.approx((0.006, 0.0015, 0.15))
+    assert (slow.notice_share, slow.news, slow.answer_s) == (0.1, 3.0, costs.answer_s)
 
 
 def test_beyond_saturation_more_reports_go_into_a_merge():
