@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F64, I32
+from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.jit import kernel
 
 F32 = NDArray[np.float32]
@@ -61,6 +61,10 @@ class PackedRays:
     def packed(self) -> "PackedRays":
         """Themselves."""
         return self
+
+    def points_at(self, rows: I64) -> F32:
+        """(K, 3) float32 the ends of some of them, from the centre."""
+        return self.points_m[rows]
 
     def from_centre(self) -> tuple[F32, F32]:
         """Ends and starts (N, 3), float32, from the centre."""

@@ -12,7 +12,7 @@ of the items. The agent, `gnd localise`, the studies, the tests and the API driv
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import FeatureTile
@@ -40,11 +40,18 @@ from gnd.vehicle_agent.result import HealthTimeline
 from gnd.vehicle_agent.scans import Guard
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from gnd.vehicle_agent.survey.surveyor import Surveyor
+from gnd.vehicle_agent.waiting import Room
 
 if TYPE_CHECKING:
     from gnd.vehicle_agent.features.layers import FeatureLayers
 
 KNOWN_COURSE_RAD = 2e-3
+_ROOM_MS: Final = 50.0
+"""With one scan, for what is not done with every scan, and for all that can wait."""
+_WINDOW_MS: Final = 20.0
+"""To make the window of a map that has changed, and what is derived of it."""
+_SEGMENTED_A_MS: Final = 15_000.0
+"""Rays."""
 COUNTS = (
     "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
     "moving_points", "rays", "changed_voxels", "tiles_doubtful", "tiles_held_back", "changes_held_back",
@@ -232,6 +239,7 @@ class Pipeline(Generic[TilesT]):
             mount, segment = header.T_vehicle_lidar, self.parameters.segment
             self.surveyor = Surveyor(mount, self.local_map, self.localisation, segment, identity, self._new_reports)
         self._feature_tiles, self._placed = feature_tiles, parts.placed
+        self._generation = 0  # of the local map with the scan before
 
     def push(self, item: DriveItem) -> Output:
         """Take the next measurement; items come in time order. One that cannot be used is counted and left out."""
@@ -243,13 +251,18 @@ class Pipeline(Generic[TilesT]):
         if isinstance(item, Detections) and self.layers is not None:
             self.layers.wait(item)  # what a camera detects waits for its pose
         poses: list[PoseEstimate] = []
-        for refined in self.localisation.push(item):  # measurements + tiles -> scans with final poses
+        placed = self.localisation.push(item)  # measurements + tiles -> scans with final poses
+        room = self._room()
+        for refined in placed:
             self._take_pose(refined, poses)
             if self.change is not None:
+                room.takes(len(refined) / _SEGMENTED_A_MS, must=True)
                 for scan in self.change.segmenter.push(refined):  # rays against rays of other scans -> which move
-                    self.change.detect(scan, busy=self._busy)  # rays + tiles -> evidence and new Gaussians
-                    self.change.report(scan, self.place.odometer_m, busy=self._busy)  # tiles left -> classes -> reports
+                    self.change.take(scan)
                     self._judge(scan)  # observations + feature tiles -> what exists, is gone, is new -> reports
+        if self.change is not None and isinstance(item, Scan):
+            # rays + tiles -> evidence and new Gaussians -> classes of tiles that were left -> reports
+            self.change.go_on(self.place.odometer_m, room)
         self._note(item)
         if self.surveyor is not None:
             self.surveyor.push(item, self.place)  # where the map has no road: scans -> submaps -> surveys
@@ -260,7 +273,8 @@ class Pipeline(Generic[TilesT]):
         poses: list[PoseEstimate] = []
         for scan in self._rest(poses):
             if self.change is not None:
-                self.change.detect(scan)
+                self.change.take(scan)
+                self.change.reporter.go_on()
                 self._judge(scan)
         if self.change is not None:
             self.change.reporter.report_all(self.place.odometer_m)
@@ -331,10 +345,13 @@ class Pipeline(Generic[TilesT]):
             "surveys": {} if self.surveyor is None else self.surveyor.account(),
         }
 
-    @property
-    def _busy(self) -> bool:
-        """The newest scan took long already."""
-        return isinstance(self.localisation, Localiser) and self.localisation.busy
+    def _room(self) -> Room:
+        """What is left after that which was done with the newest scan already, and is not done with every scan."""
+        used_ms = self.localisation.seldom_ms if isinstance(self.localisation, Localiser) else 0.0
+        if self._generation != self.local_map.generation:
+            self._generation = self.local_map.generation
+            used_ms += _WINDOW_MS
+        return Room(_ROOM_MS - used_ms)
 
     def _follow(self) -> None:
         self.tiles.follow(self.place)
@@ -393,14 +410,19 @@ class Pipeline(Generic[TilesT]):
         return FeatureLayers(self.parameters.features, self.parameters.report, self.place.frame, reporters)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ChangeDetection:
-    """What follows localisation where a vehicle reports: points that move, voxels that have changed, reports."""
+    """What follows localisation where a vehicle reports: points that move, voxels that have changed, reports.
+
+    Attributes:
+        newest: final pose, of the scans that were taken.
+    """
 
     segmenter: MotionSegmenter
     detector: ChangeDetector
     reporter: Reporter
     watch: tuple[Callable[[SegmentedScan], object], ...]
+    newest: PoseEstimate | None = None
 
     @classmethod
     def of(
@@ -418,17 +440,20 @@ class ChangeDetection:
         reporter = Reporter(detector, outbox, identity, start_ns, parameters.report, course, parts.statement)
         return cls(MotionSegmenter(parameters.segment), detector, reporter, parts.watch)
 
-    def detect(self, scan: SegmentedScan, *, busy: bool = False) -> None:
-        """Take a scan whose pose is final and whose movers are known; count the rays of those that stood the test, with
-        the next scan if the vehicle is busy with something else that takes long.
-        """
+    def take(self, scan: SegmentedScan) -> None:
+        """Take a scan whose pose is final and whose movers are known; its rays are counted later."""
         for watch in self.watch:
             watch(scan)
-        self.reporter.add_scan(scan, busy=busy)
+        self.newest = scan.scan.estimate
+        self.reporter.take(scan)
 
-    def report(self, scan: SegmentedScan, odometer_m: float, *, busy: bool) -> None:
-        """Decide the tiles that this scan's pose has left behind; what has waited long enough is reported."""
-        self.reporter.leave_behind(scan.scan.estimate, odometer_m, busy=busy)
+    def go_on(self, odometer_m: float, room: Room) -> None:
+        """As far as there is room: decide the tiles that the newest pose has left behind, report what has waited long
+        enough, test poses, and count the rays of scans that have stood the test.
+        """
+        if self.newest is not None:
+            self.reporter.leave_behind(self.newest, odometer_m, room)
+        self.reporter.go_on(room)
 
 
 def known_course(known: MotionCalibration) -> Course | None:

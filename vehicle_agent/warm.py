@@ -18,6 +18,7 @@ from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.vehicle_agent.detect.classify import classify, tile_change
 from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.detect.recent_map import recent_map
 from gnd.vehicle_agent.detect.trial import Trial
 from gnd.vehicle_agent.features.poles.detector import PoleDetector
 from gnd.vehicle_agent.local_map import LocalMap
@@ -60,6 +61,7 @@ def warm_up() -> None:
     for scan in refined:
         detector.add_scan(scan.points_map_m, scan.origins_map_m)
     _try(local_map, refined)
+    recent_map(points.astype(np.float32), NOISE_M, np.zeros(3), np.zeros(3), 50.0)  # only where a pose seems to jump
     _rolled(points)
     _stretched(local_map, points)
     _beside_others(points)

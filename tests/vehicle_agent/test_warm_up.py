@@ -12,7 +12,7 @@ PROGRAM = textwrap.dedent(
     """
     import json, sys, threading
     import gnd.vehicle_agent.agent
-    from gnd.vehicle_agent.detect import fit_kernel, kernel
+    from gnd.vehicle_agent.detect import fit_kernel, kernel, recent_map
     from gnd.vehicle_agent.warm import warm_up
     from gnd.vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
     from gnd.vehicle_agent.features.poles import kernels as poles, place_kernels as places
@@ -26,7 +26,7 @@ PROGRAM = textwrap.dedent(
     warm_up()
     again = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
     cold = [
-        f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles, fit_kernel)
+        f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles, fit_kernel, recent_map)
         for k, v in vars(m).items()
         if hasattr(v, "signatures") and not k.startswith("_") and k not in INNER
         and len(v.signatures) != FORMS.get(k, 1)

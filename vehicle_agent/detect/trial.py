@@ -22,11 +22,11 @@ from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, find_shift, gain
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan, WaitingRays
 from gnd.vehicle_agent.localise.level import looked_at, spreads
-from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import SamplingParameters
-from gnd.vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.localise.sampling import sample_candidates, sample_scan, stride_of
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
-from gnd.vehicle_agent.waiting import next_few
+from gnd.vehicle_agent.waiting import Room, few_of
 
 Verdict = Literal["good", "shifted", "unchecked"]
 
@@ -38,6 +38,13 @@ POINTS_OF_POOR_SCAN: Final = 300
 _MAX_RANGE_M: Final = 50.0
 _MOST_AT_ONCE: Final = 2
 """Scans whose rays are counted with one scan: one comes with each, and a segment at most comes at once."""
+_MOST_WAITING: Final = 10
+"""Where more have stood the test, one is given, room or not."""
+_RAYS_A_MS: Final = 8000.0
+"""That are counted."""
+_TEST_MS: Final = 6.0
+_MISFITS_MS: Final = 90.0
+"""The test of a segment that fits the map everywhere, and what one would take besides that fits it nowhere."""
 _EVERY_RECENT: Final = 2
 """So many of the last good segment's points are enough to compare with."""
 
@@ -60,9 +67,15 @@ class _TrialScan:
         """The scan as it came."""
         return SegmentedScan(RefinedScan(self.t_ns, self.rays, self.estimate), self.moving)
 
-    def still(self, points_m: F32) -> F32:
-        """(K, 3) those of its points (N, 3), from the centre of its rays, that stand."""
-        return _standing(points_m, self.moving, 1, np.zeros(3, np.float32))
+    def some(self, n: int) -> F64:
+        """(K, 3) about n of its points that stand within range, map frame; only their candidates are placed."""
+        stands = np.flatnonzero(~self.moving)
+        candidates = self.rays.points_at(stands[:: stride_of(len(stands), n)])
+        return np.asarray(candidates[sample_candidates(candidates, _sampling(n))] + self.rays.centre_m)
+
+    def looked_at(self) -> F32:
+        """(K, 3) those of its points, from the centre, that tell how its rays spread."""
+        return self.rays.points_at(looked_at(np.arange(len(self.rays))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,20 +101,22 @@ class Tried:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Recent:
-    """What the last good segment saw: points about a centre, and the small shift X (4, 4, map axes) that lays them
-    onto the base map.
+    """The last good segment, and the small shift X (4, 4, map axes) that lays what it saw onto the base map.
+
+    What it saw is placed only where it is asked for, which is seldom; until the next segment is tested the scans wait
+    anyway.
     """
 
-    centre_m: F64
-    points_m: F32
+    scans: list[_TrialScan]
     X: F64
 
-    @classmethod
-    def of(cls, scans: list[_TrialScan], some: list[F32], X: F64) -> "_Recent":
-        """Of a segment's scans, and some (K, 3) of what stands in each, from the centre of its rays."""
-        centre = scans[0].rays.centre_m
-        off = [(held.rays.centre_m - centre).astype(np.float32) for held in scans]
-        return cls(centre, np.concatenate([points + by for points, by in zip(some, off, strict=True)]), X)
+    def near(self, p_map_m: F64, noise_m: float) -> MatchMap | None:
+        """A map of what it saw within range of a place (3,); None where it saw nothing there."""
+        centre, some = self.scans[0].rays.centre_m, []
+        for held in self.scans:
+            off = (held.rays.centre_m - centre).astype(np.float32)
+            some.append(_standing(held.rays.points_m, held.moving, 1, np.zeros(3, np.float32))[::_EVERY_RECENT] + off)
+        return recent_map(np.concatenate(some), noise_m, centre, p_map_m, _MAX_RANGE_M)
 
 
 @dataclass(slots=True)
@@ -111,7 +126,7 @@ class _Segment:
 
 
 class Trial:
-    """Takes scans in time order; gives those whose poses have stood the test, some 0.5 to 1 s later.
+    """Takes scans in time order; gives those whose poses have stood the test, some 0.5 to 2 s later.
 
     Args:
         match_map: the base map that is compared with.
@@ -121,37 +136,54 @@ class Trial:
         self.counts: Counter[str] = Counter()
         self._map = match_map
         self._open: _Segment | None = None
+        self._complete: deque[_Segment] = deque()
+        """Segments that wait for their test."""
         self._passed: list[_TrialScan] = []
         self._stood: deque[_TrialScan] = deque()
         """Evidence that was not given yet: a whole segment stands the test at once, and is given scan by scan."""
         self._wrong = False  # the segment before was
-        self._waited = False  # to give evidence, for a scan
         self._tried: deque[Tried] = deque()
         self._refused_until_ns = -1
         self._recent: _Recent | None = None
 
-    def push(self, segmented: SegmentedScan, *, busy: bool = False) -> Iterator[SegmentedScan]:
-        """Take a scan; give those that are evidence now, oldest first.
+    def push(self, segmented: SegmentedScan, room: Room | None = None) -> Iterator[SegmentedScan]:
+        """Take a scan, and go on."""
+        self.take(segmented)
+        return self.go_on(room)
 
-        None, but not twice in a row, if the vehicle is busy with something else that takes long.
-        """
+    def take(self, segmented: SegmentedScan) -> None:
+        """Take a scan."""
         t_ns = segmented.scan.t_ns
         if t_ns <= self._refused_until_ns:
             self.counts["scans_taken_back"] += 1
             return
         if self._open is not None and t_ns - self._open.first_ns >= SEGMENT_NS:
-            self._close()
+            self._complete.append(self._open)
+            self._open = None
         if self._open is None:
             self._open = _Segment(t_ns)
         self._open.scans.append(_TrialScan.of(segmented))
-        self._waited = busy and not self._waited
-        if not self._waited:
-            for stood in next_few(self._stood, _MOST_AT_ONCE):
-                yield stood.restore()
+
+    def go_on(self, room: Room | None = None) -> Iterator[SegmentedScan]:
+        """Test the segments that are complete, and give scans that are evidence now, oldest first, as far as there is
+        room, by default for all that is done with one scan. A segment waits until the next is complete, not longer.
+        """
+        room = room or Room()
+        while self._complete and room.takes(_TEST_MS, must=len(self._complete) > 1):
+            shift = self._close(self._complete.popleft())
+            room.takes(_MISFITS_MS * shift.misfits / max(shift.voxels, 1), must=True)
+        for n in range(min(few_of(self._stood), _MOST_AT_ONCE)):
+            must = n == 0 and len(self._stood) > _MOST_WAITING
+            if not self._stood or not room.takes(len(self._stood[0].rays) / _RAYS_A_MS, must=must):
+                return
+            yield self._stood.popleft().restore()
 
     def flush(self) -> Iterator[SegmentedScan]:
         """The drive has ended: give what has stood the test until now."""
-        self._close()
+        for segment in self._unread():
+            self._close(segment)
+        self._open = None
+        self._complete.clear()
         self._stood.extend(self._passed)
         self._passed = []
         while self._stood:
@@ -160,15 +192,20 @@ class Trial:
     @property
     def oldest(self) -> PoseEstimate | None:
         """Pose of the oldest scan that waits."""
-        waiting = self._stood or self._passed or (self._open.scans if self._open is not None else [])
+        waiting = self._stood or self._passed or [one for segment in self._unread() for one in segment.scans]
         return waiting[0].estimate if waiting else None
+
+    def _unread(self) -> list[_Segment]:
+        """Segments that were not tested yet, the open one last."""
+        return [*self._complete, *([] if self._open is None else [self._open])]
 
     def take_back(self, until_ns: int) -> None:
         """The pose was wrong, and it is not known since when: no scan up to this time counts."""
         self._refused_until_ns = max(self._refused_until_ns, until_ns)
-        waiting = len(self._stood) + len(self._passed) + (len(self._open.scans) if self._open is not None else 0)
+        waiting = len(self._stood) + len(self._passed) + sum(len(segment.scans) for segment in self._unread())
         self.counts["scans_taken_back"] += waiting
         self._stood.clear()
+        self._complete.clear()
         self._open, self._passed, self._recent, self._wrong = None, [], None, True
 
     def take_tried(self) -> list[Tried]:
@@ -176,11 +213,8 @@ class Trial:
         tried, self._tried = list(self._tried), deque()
         return tried
 
-    def _close(self) -> None:
-        """Test the open segment; if its poses stand, those of the one before do, too."""
-        segment, self._open = self._open, None
-        if segment is None:
-            return
+    def _close(self, segment: _Segment) -> Shift:
+        """Test a segment; if its poses stand, those of the one before do, too. Gives what the test found."""
         tried = self._try(segment.scans)
         self._tried.append(tried)
         before, self._passed = self._passed, []
@@ -194,21 +228,15 @@ class Trial:
         else:
             self._stood.extend(before)
             self._passed = segment.scans
+        return tried.shift
 
     def _try(self, scans: list[_TrialScan]) -> Tried:
         """Test against the base map, and where that finds a shift against what was seen just before."""
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
-        sampled, recent, looked = [], [], np.empty((0, 3), np.float32)
-        for held in scans:
-            placed = held.rays.points_m  # once: to place the rays of a scan takes long
-            still = held.still(placed)
-            looked = looked_at(placed).copy() if held is scans[0] else looked
-            sampled.append(some_of(still, held.rays.centre_m, n))
-            recent.append(still[::_EVERY_RECENT].copy())
-        points = np.concatenate(sampled)
+        points = np.concatenate([held.some(n) for held in scans])
         T = scans[len(scans) // 2].estimate.T_map_vehicle
         points_m = transform(T_inverse(T), points)
-        seen = looked @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
+        seen = scans[0].looked_at() @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
         shift = find_shift(points_m, T, self._map.near(T[:3, 3]), planar=not spreads(seen))
         poses = [PoseUncertainty.of(held.estimate) for held in scans]
         worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
@@ -217,7 +245,7 @@ class Trial:
         if far and self._sureness(points_m, T, shift) >= OF_SCANS.z:
             verdict = "shifted"
         if verdict == "good":
-            self._recent = _Recent.of(scans, recent, T @ shift.T @ T_inverse(T))
+            self._recent = _Recent(scans, T @ shift.T @ T_inverse(T))
         elif verdict == "shifted":
             self._recent = None
         return Tried(shift, verdict, points, T, len(scans), worst)
@@ -234,11 +262,10 @@ class Trial:
         X_step = T @ shift.T @ T_inverse(T) @ T_inverse(self._recent.X)
         if replace(shift, T=T_inverse(T) @ X_step @ T).size_m < OF_SCANS.least_m:
             return shift.z
-        then = self._recent.points_m + self._recent.centre_m
-        near = then[np.linalg.norm(then - T[:3, 3], axis=1) < _MAX_RANGE_M]
-        if not len(near):
+        recent = self._recent.near(T[:3, 3], self._map.noise_m)
+        if recent is None:
             return shift.z
-        z = gain(points_m, T, X_step @ T, recent_map(near, self._map.noise_m))
+        z = gain(points_m, T, X_step @ T, recent)
         return max(shift.z, (shift.z + z) / math.sqrt(2.0)) if min(shift.z, z) > 0.0 else 0.0
 
 
@@ -268,5 +295,8 @@ def some_of(points_m: F32, centre_map_m: F64, n: int) -> F64:
         centre_map_m: (3,) the sensor.
         n: how many.
     """
-    chosen = sample_scan(points_m, SamplingParameters(n_points=n, max_range_m=_MAX_RANGE_M))
-    return np.asarray(points_m[chosen] + centre_map_m)
+    return np.asarray(points_m[sample_scan(points_m, _sampling(n))] + centre_map_m)
+
+
+def _sampling(n: int) -> SamplingParameters:
+    return SamplingParameters(n_points=n, max_range_m=_MAX_RANGE_M)

@@ -63,6 +63,8 @@ class Challenger:
         self._how = replace(AROUND_POSITION, n_refined=_N_REFINED, n_kept=_N_REFINED)
         self.rivals = PoseHypotheses(parameters.registration, _MOST_VIEWS)
         self._searched_ns = -(2**62)
+        self.searched = False
+        """With the newest view."""
         self._T_tracked = np.eye(4)
         self._way_m = 0.0
         self._own_fits: list[tuple[float, float]] = []  # since there are rivals: fit, share of a view
@@ -77,13 +79,13 @@ class Challenger:
         since the one before; `place` to search around; `new`: not the view before seen again;
         `any_heading`: the heading is in doubt too.
         """
-        self._T_tracked = T_tracked
+        self._T_tracked, self.searched = T_tracked, False
         self.rivals.move(T_before_now)
         self._way_m += float(np.hypot(*T_before_now[:2, 3]))
         if len(self.rivals) and new:
             self._weigh(points_m, standing_m, T_tracked, match_map)
         if t_ns - self._searched_ns >= (_DOUBTFUL_S if doubtful and not any_heading else _PERIOD_S) * 1e9:
-            self._searched_ns = t_ns
+            self._searched_ns, self.searched = t_ns, True
             turn_rad = np.pi if any_heading else np.radians(_TURN_DEG)
             self._search(points_m, standing_m, T_tracked, _around(place, T_tracked, turn_rad), match_map)
 

@@ -149,9 +149,9 @@ class Localiser:
         return ("lost", self._first.cause) if self.online is None else (self.online.health, self.online.cause)
 
     @property
-    def busy(self) -> bool:
-        """True when the newest scan took long to localise: what can wait is better done with the next one."""
-        return self._track is not None and self._track.busy
+    def seldom_ms(self) -> float:
+        """How long that took, as `Room` counts, which is not done with every scan, but was with the newest."""
+        return 0.0 if self._track is None else self._track.seldom_ms
 
     @property
     def drive(self) -> DriveState:

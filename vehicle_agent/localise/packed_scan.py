@@ -5,13 +5,13 @@ Points are kept as multiples of a step that the scan's farthest coordinate sets,
 that reaches beyond MAX_REACH_M is kept as it is. Points that are not finite are left out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F32, F64
+from gnd.gnd_map.arrays import F32, F64, I64
 from gnd.gnd_map.jit import bare
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
@@ -94,6 +94,10 @@ class SweptRays:
         """(N, 3) float32 their ends from the centre."""
         ends: F32 = self._placed(np.float32, self.centre_m, 0)[0]
         return ends
+
+    def points_at(self, rows: I64) -> F32:
+        """(K, 3) float32 the ends of some of them, from the centre."""
+        return replace(self, points=self.points[rows], ticks=self.ticks[rows]).points_m
 
     def from_centre(self) -> tuple[F32, F32]:
         """Ends and starts (N, 3), float32, from the centre."""

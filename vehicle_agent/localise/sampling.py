@@ -25,10 +25,31 @@ def sample_scan(
         leaf_m: side of the cube.
         min_range_m: smallest range.
     """
-    n = len(points_m)
-    # An odd stride meets every ring of a sensor with 16, 32, 64 or 128 of them.
-    stride = max(1, n // (CANDIDATES_PER_POINT * parameters.n_points)) | 1
-    chosen = np.empty(n // stride + 1, np.int64)
+    return _sampled(points_m, stride_of(len(points_m), parameters.n_points), parameters, leaf_m, min_range_m)
+
+
+def stride_of(n: int, n_points: int) -> int:
+    """Of n points in firing order, every so many are candidates for about `n_points` that are chosen.
+
+    It is odd, so that it meets every ring of a sensor with 16, 32, 64 or 128 of them.
+    """
+    return max(1, n // (CANDIDATES_PER_POINT * n_points)) | 1
+
+
+def sample_candidates(
+    points_m: NDArray[np.floating],
+    parameters: SamplingParameters,
+    leaf_m: float = LEAF_M,
+    min_range_m: float = MIN_RANGE_M,
+) -> NDArray[np.int64]:
+    """As `sample_scan`, where `points_m` are the candidates alone, every `stride_of`-th point of the scan."""
+    return _sampled(points_m, 1, parameters, leaf_m, min_range_m)
+
+
+def _sampled(
+    points_m: NDArray[np.floating], stride: int, parameters: SamplingParameters, leaf_m: float, min_range_m: float
+) -> NDArray[np.int64]:
+    chosen = np.empty(len(points_m) // stride + 1, np.int64)
     limits = (min_range_m**2, parameters.max_range_m**2)
     kept = _first_in_cubes(np.ascontiguousarray(points_m), stride, 1.0 / leaf_m, *limits, chosen)
     every = max(1.0, kept / parameters.n_points)

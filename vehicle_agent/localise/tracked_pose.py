@@ -43,6 +43,10 @@ from gnd.vehicle_agent.localise.sweep import (
 _TEACHING_FIT: Final = 0.75
 """Least fit of a match from which odometry is learnt: where much has changed, matches are off together."""
 MAX_GNSS_AGE_NS: Final = 2_000_000_000
+_COMPARE_MS: Final = 36.0
+_SEARCH_MS: Final = 13.0
+_SOLVE_MS: Final = 22.0
+"""How long it takes to compare the pose with others, to search rivals, and to solve the stretch."""
 
 FinalScan = tuple[HeldScan, SmoothedPose]
 """A scan and its final pose, in the axes of the mount in use."""
@@ -161,9 +165,13 @@ class TrackedPose:
         return self._taken(final)
 
     @property
-    def busy(self) -> bool:
-        """True when the newest scan took long: the pose was compared with others, or the stretch solved."""
-        return self.judge.uniqueness.tested or (self._refiner is not None and self._refiner.solved)
+    def seldom_ms(self) -> float:
+        """How long that took, as `Room` counts, which is not done with every scan, but was with the newest: the pose
+        was compared with others, rivals were searched, the stretch was solved.
+        """
+        solved = self._refiner is not None and self._refiner.solved
+        judge = self.judge
+        return _COMPARE_MS * judge.uniqueness.tested + _SEARCH_MS * judge.challenger.searched + _SOLVE_MS * solved
 
     def flush(self) -> list[FinalScan]:
         """Return the scans that are held, with their poses as they stand."""

@@ -49,6 +49,7 @@ from gnd.vehicle_agent.report.sink import ReportSink
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from gnd.vehicle_agent.surroundings import left_behind
 from gnd.vehicle_agent.tracks import Tracks
+from gnd.vehicle_agent.waiting import Patient, Room
 
 VOXELS_AT_ONCE = 2500  # tiles are decided with one scan until they have so many voxels: in town one or two
 STEP_M = 2.0  # tiles left behind are looked for after this much way
@@ -60,6 +61,9 @@ SOON_VOXELS: Final = 48
 errs in up to some 30."""
 _HOUR_NS: Final = 3_600_000_000_000
 _COURSE_STEP_RAD: Final = 2e-3
+_DECIDE_MS: Final = 25.0
+_REPORT_MS: Final = 9.0
+"""To decide the tiles that are decided at once, and to report a district."""
 _SOON_S: Final = 0.3
 """Such a report waits this long for tiles that are left together with the first ..."""
 APART_S: Final = 3.0
@@ -204,12 +208,15 @@ class Reporter:
         self._doubts = TileDoubts(detector.local_map.grid_frame)
         self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
         self._shifted = 0
-        self._waited = False  # to decide and report, for a scan
+        self._to_decide, self._to_report = Patient(), Patient()
 
-    def add_scan(self, segmented: SegmentedScan, *, busy: bool = False) -> None:
-        """Count the scan's rays, if its pose is good enough for evidence and has stood the shift test; later, if the
-        vehicle is busy with something else that takes long.
-        """
+    def add_scan(self, segmented: SegmentedScan) -> None:
+        """Take a scan, and go on."""
+        self.take(segmented)
+        self.go_on()
+
+    def take(self, segmented: SegmentedScan) -> None:
+        """Take a scan: it waits for its test, if its pose is good enough for evidence."""
         estimate = segmented.scan.estimate
         pose, most = PoseUncertainty.of(estimate), self._parameters
         if estimate.health != "good" or pose.sigma_m > most.max_sigma_m or pose.sigma_rad > most.max_sigma_rad:
@@ -222,7 +229,11 @@ class Reporter:
         if not most.check_poses:
             self._count(segmented)
             return
-        for one in self._trial.push(segmented, busy=busy):
+        self._trial.take(segmented)
+
+    def go_on(self, room: Room | None = None) -> None:
+        """Test poses, and count the rays of scans that have stood the test, as far as there is room."""
+        for one in self._trial.go_on(room):
             self._count(one)
         self._hear_trial()
 
@@ -276,21 +287,23 @@ class Reporter:
         self._lengthen(scan.t_ns)
         self._tracks.add_scan(scan.t_ns, ends_m, starts_m, scan.estimate.T_map_vehicle)
 
-    def leave_behind(self, estimate: PoseEstimate, odometer_m: float, *, busy: bool = False) -> None:
-        """Decide the tiles that the refined pose has left, and report what has waited long enough; with the next scan,
-        if the vehicle is busy with something else that takes long.
+    def leave_behind(self, estimate: PoseEstimate, odometer_m: float, room: Room | None = None) -> None:
+        """Decide the tiles that the refined pose has left, and report what has waited long enough; with one of the next
+        scans, if there is no room now.
         """
-        self._waited = busy and not self._waited
-        if self._waited:
-            return
-        self._here_ns = estimate.t_ns
-        self._decide_left(estimate, odometer_m)
-        for district, pending in list(self._pending.items()):
-            due = pending.is_due(odometer_m, estimate.t_ns, self._reported_ns, self._parameters)
-            if due or district not in self._open_districts:
+        room, self._here_ns = room or Room(), estimate.t_ns
+        self._decide_left(estimate, odometer_m, room)
+        due = [
+            district
+            for district, pending in self._pending.items()
+            if district not in self._open_districts
+            or pending.is_due(odometer_m, estimate.t_ns, self._reported_ns, self._parameters)
+        ]
+        for district in due:
+            if self._to_report.may(_REPORT_MS, room):
                 self._report(district)
 
-    def _decide_left(self, estimate: PoseEstimate, odometer_m: float) -> None:
+    def _decide_left(self, estimate: PoseEstimate, odometer_m: float, room: Room) -> None:
         waiting = self._trial.oldest  # what it saw is not counted yet: its tiles are not left
         frame = self._detector.local_map.grid_frame.frame
         p_map = (estimate if waiting is None else waiting).T_map_vehicle[:3, 3]
@@ -301,7 +314,7 @@ class Reporter:
         self._tracks.touched(touched)
         open_tiles = set(touched) | set(self._doubts.tiles())
         left = left_behind(frame, open_tiles, p_map, self._left_behind_m)
-        now = self._few_of(left)
+        now = self._few_of(left) if left and self._to_decide.may(_DECIDE_MS, room) else ()
         if len(now) < len(left):
             self._looked_at = None  # the rest with the next scans
         self._decide(now, odometer_m)
