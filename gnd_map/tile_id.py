@@ -281,7 +281,11 @@ def _cover(lat: F64, lon: F64, radius_m: float) -> I64:
         raise TileError(
             f"a radius of {radius_m} m needs {(2 * east + 1) * (2 * north + 1)} tiles, more than {_MAX_COVER}"
         )
-    found = [_near(a, b, p, q, east, north, radius_m) for a, b, p, q in zip(lat, lon, u, v, strict=True)]
+    at_once = max(1, _MAX_COVER // ((2 * east + 1) * (2 * north + 1)))
+    found = [
+        _near(lat[k : k + at_once], lon[k : k + at_once], u[k : k + at_once], v[k : k + at_once], east, north, radius_m)
+        for k in range(0, len(lat), at_once)
+    ]
     return np.unique(np.concatenate(found))
 
 
@@ -293,12 +297,15 @@ def _reach(lat: F64, radius_m: float) -> tuple[int, int]:
     return min(int(min(radius_m / max(width_m, 1e-9), LON_TILES)) + 1, LON_TILES // 2), north
 
 
-def _near(lat: float, lon: float, u: float, v: float, east: int, north: int, radius_m: float) -> I64:
-    """Morton codes of the tiles around one position whose nearest point is within `radius_m`."""
-    i, j = np.meshgrid(int(np.floor(u)) + np.arange(-east, east + 1), int(np.floor(v)) + np.arange(-north, north + 1))
-    inside = (j >= 0) & (j < LAT_TILES)
+def _near(lat: F64, lon: F64, u: F64, v: F64, east: int, north: int, radius_m: float) -> I64:
+    """Morton codes of the tiles around some positions (P,) whose nearest point is within `radius_m`, some twice."""
+    wide, high = np.meshgrid(np.arange(-east, east + 1), np.arange(-north, north + 1))
+    i = np.floor(u).astype(np.int64)[:, None] + wide.ravel()
+    j = np.floor(v).astype(np.int64)[:, None] + high.ravel()
+    at, _ = inside = np.nonzero((j >= 0) & (j < LAT_TILES))
     i, j = i[inside], j[inside]
-    nearest = geodetic_of_tile_coordinates(np.clip(u, i, i + 1), np.clip(v, j, j + 1))
-    distance_m = np.linalg.norm(ecef_from_geodetic(*nearest, 0.0) - ecef_from_geodetic(lat, lon, 0.0), axis=-1)
+    nearest = geodetic_of_tile_coordinates(np.clip(u[at], i, i + 1), np.clip(v[at], j, j + 1))
+    here = ecef_from_geodetic(lat, lon, 0.0)
+    distance_m = np.linalg.norm(ecef_from_geodetic(*nearest, 0.0) - here[at], axis=-1)
     near = distance_m <= radius_m + 1e-9
     return interleave(i[near] % LON_TILES, j[near])

@@ -32,12 +32,13 @@ Touched = Callable[[TileId], bool]
 class HeldTile:
     """One tile turned into the map frame.
 
-    `g` (N, 3) int32 global voxel coordinates, `mean_map_m` (N, 3) and `cov_m2` (N, 6: xx, xy, xz, yy, yz, zz) float64
+    `box` its columns (see `tile_box`), `g` (N, 3) int32 global voxel coordinates, `mean_map_m` (N, 3) and `cov_m2` (N, 6: xx, xy, xz, yy, yz, zz) float64
     along the map frame's axes. `absent`: the store has no such tile, so every voxel is known to be empty in the map.
     """
 
     tile: Tile
     absent: bool
+    box: NDArray[np.int64]
     g: NDArray[np.int32]
     mean_map_m: NDArray[np.float64]
     cov_m2: NDArray[np.float64]
@@ -140,7 +141,8 @@ class LocalMap:
     def box_of(self, tile_id: TileId, origin_g: NDArray[np.int64] | None = None) -> tuple[slice, slice]:
         """The tile's columns along x and y in a window at `origin_g` (3,), by default in `index`."""
         origin = self.window_origin_g if origin_g is None else origin_g
-        low, high = tile_box(self.grid_frame, tile_id) - origin[:2]
+        held = self._held.get(tile_id)
+        low, high = (tile_box(self.grid_frame, tile_id) if held is None else held.box) - origin[:2]
         return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
 
     def _hold(self, held: HeldTile) -> None:
@@ -175,7 +177,7 @@ class LocalMap:
         first = 0
         for one in held:
             tile_id, n = one.tile.tile_id, len(one.g)
-            (x0, y0), (x1, y1) = tile_box(self.grid_frame, tile_id) - self._origin_g[:2]
+            (x0, y0), (x1, y1) = one.box - self._origin_g[:2]
             self._index[x0:x1, y0:y1] = EMPTY
             at = one.g - self._origin_g
             self._index[at[:, 0], at[:, 1], at[:, 2]] = np.arange(first, first + n, dtype=np.int32)
@@ -184,7 +186,7 @@ class LocalMap:
 
     def _extent(self, held: list[HeldTile]) -> tuple[NDArray[np.int64], tuple[int, int, int]]:
         """Origin and shape of the box of all held tiles, with room above and below."""
-        boxes = np.array([tile_box(self.grid_frame, h.tile.tile_id) for h in held])
+        boxes = np.array([h.box for h in held])
         low, high = self._floor_range(held)
         origin = np.array([*boxes[:, 0].min(axis=0), low])
         shape = np.array([*boxes[:, 1].max(axis=0), high + 1]) - origin
@@ -218,6 +220,7 @@ def held_tile(grid_frame: GridFrame, tile: Tile, *, absent: bool = False) -> Hel
     return HeldTile(
         tile=tile,
         absent=absent,
+        box=tile_box(grid_frame, tile.tile_id),
         g=np.asarray(grid_frame.grid_of_voxel(tile.tile_id, gaussians.voxel_id), np.int32).reshape(-1, 3),
         mean_map_m=p_tile @ R_map_tile.T + T_map_tile[:3, 3],
         cov_m2=six_entries(R_map_tile @ full_matrices(gaussians.cov_m2) @ R_map_tile.T),

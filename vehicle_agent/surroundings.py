@@ -60,10 +60,12 @@ class Surroundings:
         self._parameters = parameters
         self._rate_byte_s = LINK_SHARE * fetcher.link.rate_byte_s("down")
         self.wanted: tuple[TileId, ...] = ()
+        self._around: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
         self._here: F64 | None = None
         self._asked: set[TileId] = set()  # with the last question, and not let go since
         self._besides: tuple[TileId, ...] = ()  # named with the next one, whenever that is
+        self._besides_set: frozenset[TileId] = frozenset()  # the same
         self._named: frozenset[District] = frozenset()  # of these districts
         self._passed: set[TileId] = set()  # let go: asked for again when they are wanted, not before
         self._beyond: tuple[TileId, ...] = ()  # farther ahead than the plan
@@ -77,10 +79,13 @@ class Surroundings:
         self.given_up: set[TileId] = set()
 
     def look_ahead(self, place: Place) -> tuple[TileId, ...]:
-        """Plan anew after a few metres of way; gives the tiles around and ahead, those of `HELD_AHEAD_M` included."""
+        """Plan anew after a few metres of way; gives the tiles around and ahead, those of `HELD_AHEAD_M` included: the
+        same object until it plans anew.
+        """
         if self._has_moved(place):
             self._look(place)
-        return (*self.wanted, *self._beyond)
+            self._around = (*self.wanted, *self._beyond)
+        return self._around
 
     def follow(self, place: Place, stop: threading.Event, *, wait: bool) -> None:
         """Ask for what lies around and ahead and hold what is near; `wait` for the answers about that."""
@@ -177,6 +182,7 @@ class Surroundings:
         districts = frozenset({tile.district for tile in self.wanted} | self._nearby())
         if districts != self._named:
             self._named, self._besides = districts, self._of_known_districts(districts)
+            self._besides_set = frozenset(self._besides)
 
     def _of_known_districts(self, districts: Collection[District]) -> tuple[TileId, ...]:
         """All tiles of the plan's districts and of those nearby, where the cache holds much of the plan: most are on no
@@ -231,8 +237,7 @@ class Surroundings:
     def _let_go(self, here: F64) -> None:
         """Drop tiles far behind that nothing is counted about, and answers about tiles that are no longer wanted."""
         frame, limit_m = self._map.grid_frame.frame, self._parameters.forget_m
-        kept = self._asked.union(self.wanted, self._besides)
-        gone = [t for t in self._arrived if t not in kept]
+        gone = sorted(set(self._arrived).difference(self._asked, self.wanted, self._besides_set))
         for tile_id in gone:
             del self._arrived[tile_id]
         for tile_id in left_behind(frame, self._map.tiles, here, limit_m):
@@ -301,4 +306,6 @@ class TileRectangles:
 
 def left_behind(frame: LocalFrame, tiles: Iterable[TileId], p_map_m: F64, distance_m: float) -> tuple[TileId, ...]:
     """Those of `tiles` that are farther away than `distance_m`."""
-    return tuple(t for t in tiles if tile_distance_m(frame, t, p_map_m) > distance_m)
+    some = tuple(tiles)
+    away_m = TileRectangles.of(frame, some).distances_m(p_map_m)
+    return tuple(some[n] for n in np.flatnonzero(away_m > distance_m))

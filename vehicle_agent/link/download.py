@@ -155,6 +155,8 @@ class TileFetcher(Generic[TileT]):
         """
         now_s = time.monotonic()
         with self._changed:
+            if now_s - min(self._answered_s.values(), default=now_s) < older_than_s:
+                return  # nearly always: thousands of tiles are not looked at one by one
             age_s = {tile_id: now_s - self._answered_s.get(tile_id, 0.0) for tile_id in self._answered - self._stale}
             if max(age_s.values(), default=-1.0) >= older_than_s:
                 old = {tile_id for tile_id, one_s in age_s.items() if one_s >= older_than_s / 2}

@@ -12,7 +12,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import TileId, deinterleave, geodetic_of_tile_coordinates
 
 SLOWEST_MPS = 3.0
 """A vehicle that stands may start: what is ahead keeps its order."""
@@ -76,8 +76,10 @@ def needs(frame: LocalFrame, tiles: Sequence[TileId], course: VehicleCourse, nea
 
 def tile_boxes_m(frame: LocalFrame, tiles: Sequence[TileId]) -> tuple[F64, F64]:
     """South-west and north-east corners (N, 2) of tiles in a frame of at most a few kilometres, to about 1 cm."""
-    corners = np.array([(t.south_west_rad, t.north_east_rad) for t in tiles]).reshape(-1, 2, 2)
-    enu = frame.enu_from_geodetic(corners[..., 0].ravel(), corners[..., 1].ravel(), np.zeros(2 * len(tiles)))
+    east, north = deinterleave(np.array([tile.morton for tile in tiles], np.int64))
+    steps = np.array([0.0, 1.0])  # to the south-west corner, and to the north-east one
+    lat, lon = geodetic_of_tile_coordinates(east[:, None] + steps, north[:, None] + steps)
+    enu = frame.enu_from_geodetic(lat.ravel(), lon.ravel(), np.zeros(2 * len(tiles)))
     ends = np.asarray(enu)[:, :2].reshape(-1, 2, 2)
     return ends[:, 0], ends[:, 1]
 

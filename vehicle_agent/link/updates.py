@@ -39,12 +39,17 @@ class Updates(Generic[TileT]):
         self._cache, self._fetcher, self._on_tile = cache, fetcher, on_tile
         self._notices = Notices(bus)
         self._rechecked_s = time.monotonic()
+        self._followed: Collection[TileId] = ()
 
     def follow(self, tiles: Collection[TileId]) -> None:
-        """Listen to the districts of these tiles, and to the few that were left last.
+        """Listen to the districts of these tiles, and to the few that were left last; of the same object as before
+        nothing is to be done.
 
         A subscription a tile would cost more to declare than the notices that it keeps away.
         """
+        if tiles is self._followed:
+            return
+        self._followed = tiles
         districts = sorted({tile.district for tile in tiles})
         self._notices.follow([update_keys(self._cache.layer, district.path) for district in districts])
 
