@@ -5,12 +5,13 @@ because a ray or a point looks up one address: a typed dict was measured 12 to 1
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.gaussian import Gaussians, full_matrices, six_entries
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame, VoxelGrid
@@ -34,6 +35,7 @@ class HeldTile:
 
     `box` its columns (see `tile_box`), `g` (N, 3) int32 global voxel coordinates, `mean_map_m` (N, 3) and `cov_m2` (N, 6: xx, xy, xz, yy, yz, zz) float64
     along the map frame's axes. `absent`: the store has no such tile, so every voxel is known to be empty in the map.
+    `made`: what others have made of its Gaussians, see `LocalMap.of_gaussians`.
     """
 
     tile: Tile
@@ -42,6 +44,7 @@ class HeldTile:
     g: NDArray[np.int32]
     mean_map_m: NDArray[np.float64]
     cov_m2: NDArray[np.float64]
+    made: dict[object, F64] = field(default_factory=dict)
 
 
 class LocalMap:
@@ -137,6 +140,19 @@ class LocalMap:
         """
         self._build()
         return self._derived
+
+    def of_gaussians(self, key: object, make: Callable[[F64], F64]) -> F64:
+        """(M, ...) what `make` makes of covariances (N, 6), Gaussian by Gaussian; of each tile that is held once.
+
+        Args:
+            key: of what is made.
+            make: gives (N, ...).
+        """
+        self._build()
+        for held in self._held.values():
+            if key not in held.made:
+                held.made[key] = make(held.cov_m2)
+        return np.concatenate([self._held[tile_id].made[key] for tile_id in self._tile_rows] or [make(self._cov)])
 
     def box_of(self, tile_id: TileId, origin_g: NDArray[np.int64] | None = None) -> tuple[slice, slice]:
         """The tile's columns along x and y in a window at `origin_g` (3,), by default in `index`."""

@@ -51,6 +51,8 @@ def test_rays_from_their_centre_are_those_of_the_map_frame(reach_m):
     rays = pack(scan_of(reach_m)).placed(sweep(), MOUNT, 1_000, pose(812.0, -4711.0, 40.0))
     ends, starts = rays.restore()
     points, origins = rays.from_centre()
+    some = np.array([0, 7, 7, len(rays) - 1])
+    np.testing.assert_array_equal(rays.points_at(some), points[some])
     assert points.dtype == origins.dtype == np.float32
     assert len(rays) == len(points)
     np.testing.assert_array_equal(points, rays.points_m)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnd.vehicle_agent.localise.parameters import SamplingParameters
-from gnd.vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.localise.sampling import sample_candidates, sample_scan, stride_of
 
 
 def cloud(n, seed=0, reach=50.0):
@@ -25,6 +25,15 @@ def test_at_most_the_wanted_number_in_firing_order(n, seed, wanted):
 
 def test_enough_points_give_about_the_wanted_number():
     assert len(sample_scan(cloud(60_000), SamplingParameters(n_points=2500))) == pytest.approx(2500, abs=1)
+
+
+@pytest.mark.parametrize("n", [0, 1, 999, 60_000, 130_001])
+def test_the_candidates_alone_give_the_same_points(n):
+    points, parameters = cloud(n), SamplingParameters(n_points=600)
+    candidates = points[:: stride_of(n, 600)]
+    np.testing.assert_array_equal(
+        candidates[sample_candidates(candidates, parameters)], points[sample_scan(points, parameters)]
+    )
 
 
 def test_few_points_are_all_looked_at():

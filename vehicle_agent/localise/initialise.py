@@ -207,7 +207,7 @@ def ground_below(points_m: F64) -> float:
     near = np.sort(points_m[np.hypot(points_m[:, 0], points_m[:, 1]) < 15.0, 2])  # once, for all that follows
     if not len(near):
         return 0.0
-    low = near[: np.searchsorted(near, _quantile(near, 0.6), side="right")]
+    low = near[: np.searchsorted(near, quantile_of(near, 0.6), side="right")]
     edges = np.linspace(low[0], low[-1], max(1, int((low[-1] - low[0]) / 0.2)) + 1)
     begin = np.searchsorted(low, edges)
     begin[-1] = len(low)
@@ -217,7 +217,7 @@ def ground_below(points_m: F64) -> float:
     return found if found < HIGHEST_GROUND_M else 0.0
 
 
-def _quantile(rising: F64, share: float) -> float:
+def quantile_of(rising: F64, share: float) -> float:
     """As `numpy.quantile` of numbers (N,) that are sorted already."""
     at = share * (len(rising) - 1)
     low, high = float(rising[int(at)]), float(rising[min(int(at) + 1, len(rising) - 1)])

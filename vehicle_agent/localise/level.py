@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
+from gnd.vehicle_agent.localise.initialise import quantile_of
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import WHEELS_M, settle
@@ -47,8 +48,8 @@ def spreads(rays: npt.NDArray[np.generic]) -> bool:
     far = horizontal > 0.0
     if not far.any():
         return True
-    low, high = np.quantile(np.arctan2(some[far, 2], horizontal[far]), [0.05, 0.95])
-    return bool(np.degrees(high - low) >= LEAST_SPREAD_DEG)
+    rising = np.sort(np.arctan2(some[far, 2], horizontal[far]))
+    return bool(np.degrees(quantile_of(rising, 0.95) - quantile_of(rising, 0.05)) >= LEAST_SPREAD_DEG)
 
 
 def settled(

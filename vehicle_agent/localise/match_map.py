@@ -38,9 +38,7 @@ class MatchMap:
         cls, index: NDArray[np.int32], A: ArrayLike, b: ArrayLike, mean_m: ArrayLike, cov_m2: ArrayLike, noise_m: float
     ) -> "MatchMap":
         """From plain arrays: `mean_m` (M, 3) and `cov_m2` (M, 6) in the map frame; `noise_m` one sigma of a point."""
-        cov = np.ascontiguousarray(cov_m2, dtype=np.float64).reshape(-1, 6)
-        information = np.empty_like(cov)
-        tapered_information(cov, noise_m**2, UNIFORM_VOXEL_M2, information)
+        information = information_of(np.asarray(cov_m2, np.float64).reshape(-1, 6), noise_m)
         return cls(
             index=np.ascontiguousarray(index, dtype=np.int32),
             A=np.ascontiguousarray(A, dtype=np.float64),
@@ -52,6 +50,14 @@ class MatchMap:
     def __len__(self) -> int:
         """Number of Gaussians."""
         return len(self.mean_m)
+
+
+def information_of(cov_m2: F64, noise_m: float) -> F64:
+    """(N, 6) the information of Gaussians with covariances (N, 6); `noise_m` one sigma of a point."""
+    cov = np.ascontiguousarray(cov_m2)
+    information = np.empty_like(cov)
+    tapered_information(cov, noise_m**2, UNIFORM_VOXEL_M2, information)
+    return information
 
 
 class MatchMapCache:
@@ -78,7 +84,8 @@ class MatchMapCache:
         A, b = np.ascontiguousarray(A), b - held.window_origin_g  # kernels are compiled for one layout
         like: MatchMap | None = held.derived.get(shared)
         if like is None:
-            like = MatchMap.of(held.index, A, b, held.mean_map_m, held.cov_m2, self.noise_m)
+            information = held.of_gaussians(shared, lambda cov_m2: information_of(cov_m2, self.noise_m))
+            like = MatchMap(held.index, A, b, held.mean_map_m, information)
         made = MatchMap(like.index, A, b, like.mean_m, like.information)
         held.derived[shared] = held.derived[self] = made
         self._near_m = np.array(p_map_m, dtype=np.float64)
