@@ -33,9 +33,9 @@ Touched = Callable[[TileId], bool]
 class HeldTile:
     """One tile turned into the map frame.
 
-    `box` its columns (see `tile_box`), `g` (N, 3) int32 global voxel coordinates, `mean_map_m` (N, 3) and `cov_m2` (N, 6: xx, xy, xz, yy, yz, zz) float64
-    along the map frame's axes. `absent`: the store has no such tile, so every voxel is known to be empty in the map.
-    `made`: what others have made of its Gaussians, see `LocalMap.of_gaussians`.
+    `box` its columns (see `tile_box`), `g` (N, 3) int32 global voxel coordinates, `mean_map_m` (N, 3) and `cov_m2`
+    (N, 6: xx, xy, xz, yy, yz, zz) float64 along the map frame's axes. `absent`: the store has no such tile, so every
+    voxel is known to be empty in the map. `made`: what others have made of its Gaussians, see `LocalMap.of_gaussians`.
     """
 
     tile: Tile
