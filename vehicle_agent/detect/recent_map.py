@@ -23,7 +23,7 @@ def recent_map(
     """A Gaussian for each 1 m cube of the map frame in which enough points lie; the others are empty.
 
     Args:
-        points_m: (N, 3), about a centre.
+        points_m: (N, 3), C-contiguous, about a centre.
         noise_m: one sigma of a point.
         centre_m: (3,), map frame; None: its origin.
         about_m: (3,), map frame: points that are farther from there are left out; None: none is.
@@ -32,7 +32,7 @@ def recent_map(
     Returns:
         The map; None where no point is left.
     """
-    points, centre = np.ascontiguousarray(points_m), np.zeros(3) if centre_m is None else centre_m
+    points, centre = points_m, np.zeros(3) if centre_m is None else centre_m
     about, reach = (np.zeros(3), np.inf) if about_m is None else (np.ascontiguousarray(about_m), reach_m)
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     if not extent_of(points, centre, about, reach, low, high):
