@@ -40,7 +40,7 @@ from gnd.vehicle_agent.result import HealthTimeline
 from gnd.vehicle_agent.scans import Guard
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from gnd.vehicle_agent.survey.surveyor import Surveyor
-from gnd.vehicle_agent.waiting import Room
+from gnd.vehicle_agent.waiting import ScanRoom
 
 if TYPE_CHECKING:
     from gnd.vehicle_agent.features.layers import FeatureLayers
@@ -345,13 +345,13 @@ class Pipeline(Generic[TilesT]):
             "surveys": {} if self.surveyor is None else self.surveyor.account(),
         }
 
-    def _room(self) -> Room:
+    def _room(self) -> ScanRoom:
         """What is left after that which was done with the newest scan already, and is not done with every scan."""
         used_ms = self.localisation.seldom_ms if isinstance(self.localisation, Localiser) else 0.0
         if self._generation != self.local_map.generation:
             self._generation = self.local_map.generation
             used_ms += _WINDOW_MS
-        return Room(_ROOM_MS - used_ms)
+        return ScanRoom(_ROOM_MS - used_ms)
 
     def _follow(self) -> None:
         self.tiles.follow(self.place)
@@ -447,7 +447,7 @@ class ChangeDetection:
         self.newest = scan.scan.estimate
         self.reporter.take(scan)
 
-    def go_on(self, odometer_m: float, room: Room) -> None:
+    def go_on(self, odometer_m: float, room: ScanRoom) -> None:
         """As far as there is room: decide the tiles that the newest pose has left behind, report what has waited long
         enough, test poses, and count the rays of scans that have stood the test.
         """

@@ -13,7 +13,7 @@ MOST_WAITING: Final = 4
 
 
 @dataclass(slots=True)
-class Room:
+class ScanRoom:
     """How much of the work that can wait may still be done with the newest scan.
 
     What work takes is estimated from how much there is to do, never measured: results must not depend on how fast a
@@ -48,7 +48,7 @@ class Patient:
 
     waited: int = 0
 
-    def may(self, ms: float, room: Room) -> bool:
+    def may(self, ms: float, room: ScanRoom) -> bool:
         """Whether it is to be done now; takes so long of the room then."""
         may = room.takes(ms, must=self.waited >= MOST_WAITING)
         self.waited = 0 if may else self.waited + 1

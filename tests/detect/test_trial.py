@@ -8,7 +8,7 @@ from gate_scene import CORRIDOR, START_NS, WALLS, map_of, match_maps, scan, seen
 
 from gnd.vehicle_agent.detect.trial import Trial, _standing
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.waiting import Room
+from gnd.vehicle_agent.waiting import ScanRoom
 
 SEGMENT = 5  # scans of 0.1 s
 
@@ -58,7 +58,7 @@ def test_a_busy_vehicle_counts_a_scan_later_and_all_in_order(
 ) -> None:
     one, counted, most = trial(yard), list[int](), 0
     for k in range(60):
-        found = numbers(one.push(scan(points[k % len(points)], k), Room(0.0 if busy(k) else 1000.0)))
+        found = numbers(one.push(scan(points[k % len(points)], k), ScanRoom(0.0 if busy(k) else 1000.0)))
         assert len(found) <= (1 if busy(k) else 2), "it waits for one of the next scans"
         counted += found
         most = max(most, k - len(counted))

@@ -22,7 +22,7 @@ from gnd.vehicle_agent.packed_rays import PlacedRays
 from gnd.vehicle_agent.report import reporter as reporting
 from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment import SegmentedScan
-from gnd.vehicle_agent.waiting import MOST_WAITING, Room
+from gnd.vehicle_agent.waiting import MOST_WAITING, ScanRoom
 
 START_NS = 1_570_838_400_000_000_000
 WHO = Identity("vehicle-7", "drive-7", "VLP-16", "ndt")
@@ -138,7 +138,7 @@ def test_tiles_left_at_once_are_decided_scan_by_scan_and_later_while_the_vehicle
     drive, decided = reporter(tiles, outbox, **PATIENT), [0]
     drive.add_scan(scan(hits))
     for busy in [True, False] * (len(tiles) + 2):
-        drive.leave_behind(estimate(x_m=200.0), 200.0, Room(0.0 if busy else 1000.0))
+        drive.leave_behind(estimate(x_m=200.0), 200.0, ScanRoom(0.0 if busy else 1000.0))
         decided.append(sum(drive.classes.values()))
     steps = np.diff(decided)
     assert not steps[::2].any()  # those in which it was busy
@@ -152,7 +152,7 @@ def test_where_there_is_never_room_tiles_are_decided_and_reported_all_the_same(
     drive, decided = reporter(tiles, outbox, **PATIENT), [0]
     drive.add_scan(scan(hits))
     for _ in range(3 * (MOST_WAITING + 1)):
-        drive.leave_behind(estimate(x_m=200.0), 200.0, Room(0.0))
+        drive.leave_behind(estimate(x_m=200.0), 200.0, ScanRoom(0.0))
         decided.append(sum(drive.classes.values()))
     assert np.flatnonzero(np.diff(decided))[0] == MOST_WAITING
     assert sorted(c.tile for r in reports(outbox) for c in r.tiles) == sorted(tiles)

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from gnd.vehicle_agent.waiting import MOST_WAITING, Patient, Room, next_few
+from gnd.vehicle_agent.waiting import MOST_WAITING, Patient, ScanRoom, next_few
 
 
 def test_a_burst_is_worked_off_in_parts_in_order_and_soon() -> None:
@@ -19,20 +19,20 @@ def test_a_burst_is_worked_off_in_parts_in_order_and_soon() -> None:
 
 
 def test_there_is_room_until_it_is_used_and_for_what_has_waited_long_enough() -> None:
-    room = Room(50.0)
+    room = ScanRoom(50.0)
     assert [room.takes(20.0) for _ in range(3)] == [True, True, False]
     assert room.takes(10.0)
     assert not room.takes(0.1)
     assert room.takes(20.0, must=True)
     assert room.left_ms == -20.0
-    assert Room().takes(1e9)
+    assert ScanRoom().takes(1e9)
 
 
 def test_what_is_patient_waits_for_room_but_not_for_ever() -> None:
     one = Patient()
-    assert [one.may(9.0, Room(5.0)) for _ in range(2 * MOST_WAITING + 2)] == 2 * ([False] * MOST_WAITING + [True])
-    assert not one.may(9.0, Room(5.0))
-    room = Room(10.0)
+    assert [one.may(9.0, ScanRoom(5.0)) for _ in range(2 * MOST_WAITING + 2)] == 2 * ([False] * MOST_WAITING + [True])
+    assert not one.may(9.0, ScanRoom(5.0))
+    room = ScanRoom(10.0)
     assert one.may(9.0, room)
     assert room.left_ms == 1.0
     assert one.waited == 0

@@ -26,7 +26,7 @@ from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import SamplingParameters
 from gnd.vehicle_agent.localise.sampling import sample_candidates, sample_scan, stride_of
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
-from gnd.vehicle_agent.waiting import Room, few_of
+from gnd.vehicle_agent.waiting import ScanRoom, few_of
 
 Verdict = Literal["good", "shifted", "unchecked"]
 
@@ -146,7 +146,7 @@ class Trial:
         self._refused_until_ns = -1
         self._recent: _Recent | None = None
 
-    def push(self, segmented: SegmentedScan, room: Room | None = None) -> Iterator[SegmentedScan]:
+    def push(self, segmented: SegmentedScan, room: ScanRoom | None = None) -> Iterator[SegmentedScan]:
         """Take a scan, and go on."""
         self.take(segmented)
         return self.go_on(room)
@@ -164,11 +164,11 @@ class Trial:
             self._open = _Segment(t_ns)
         self._open.scans.append(_TrialScan.of(segmented))
 
-    def go_on(self, room: Room | None = None) -> Iterator[SegmentedScan]:
+    def go_on(self, room: ScanRoom | None = None) -> Iterator[SegmentedScan]:
         """Test the segments that are complete, and give scans that are evidence now, oldest first, as far as there is
         room, by default for all that is done with one scan. A segment waits until the next is complete, not longer.
         """
-        room = room or Room()
+        room = room or ScanRoom()
         while self._complete and room.takes(_TEST_MS, must=len(self._complete) > 1):
             shift = self._close(self._complete.popleft())
             room.takes(_MISFITS_MS * shift.misfits / max(shift.voxels, 1), must=True)

@@ -150,7 +150,7 @@ class Localiser:
 
     @property
     def seldom_ms(self) -> float:
-        """How long that took, as `Room` counts, which is not done with every scan, but was with the newest."""
+        """How long that took, as `ScanRoom` counts, which is not done with every scan, but was with the newest."""
         return 0.0 if self._track is None else self._track.seldom_ms
 
     @property

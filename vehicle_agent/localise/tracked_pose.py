@@ -166,8 +166,8 @@ class TrackedPose:
 
     @property
     def seldom_ms(self) -> float:
-        """How long that took, as `Room` counts, which is not done with every scan, but was with the newest: the pose
-        was compared with others, rivals were searched, the stretch was solved.
+        """How long that took, as `ScanRoom` counts, which is not done with every scan, but was with the newest: to
+        compare the pose with others, to search rivals, to solve the stretch.
         """
         solved = self._refiner is not None and self._refiner.solved
         judge = self.judge

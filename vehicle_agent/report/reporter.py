@@ -49,7 +49,7 @@ from gnd.vehicle_agent.report.sink import ReportSink
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from gnd.vehicle_agent.surroundings import left_behind
 from gnd.vehicle_agent.tracks import Tracks
-from gnd.vehicle_agent.waiting import Patient, Room
+from gnd.vehicle_agent.waiting import Patient, ScanRoom
 
 VOXELS_AT_ONCE = 2500  # tiles are decided with one scan until they have so many voxels: in town one or two
 STEP_M = 2.0  # tiles left behind are looked for after this much way
@@ -231,7 +231,7 @@ class Reporter:
             return
         self._trial.take(segmented)
 
-    def go_on(self, room: Room | None = None) -> None:
+    def go_on(self, room: ScanRoom | None = None) -> None:
         """Test poses, and count the rays of scans that have stood the test, as far as there is room."""
         for one in self._trial.go_on(room):
             self._count(one)
@@ -287,11 +287,11 @@ class Reporter:
         self._lengthen(scan.t_ns)
         self._tracks.add_scan(scan.t_ns, ends_m, starts_m, scan.estimate.T_map_vehicle)
 
-    def leave_behind(self, estimate: PoseEstimate, odometer_m: float, room: Room | None = None) -> None:
+    def leave_behind(self, estimate: PoseEstimate, odometer_m: float, room: ScanRoom | None = None) -> None:
         """Decide the tiles that the refined pose has left, and report what has waited long enough; with one of the next
         scans, if there is no room now.
         """
-        room, self._here_ns = room or Room(), estimate.t_ns
+        room, self._here_ns = room or ScanRoom(), estimate.t_ns
         self._decide_left(estimate, odometer_m, room)
         due = [
             district
@@ -303,7 +303,7 @@ class Reporter:
             if self._to_report.may(_REPORT_MS, room):
                 self._report(district)
 
-    def _decide_left(self, estimate: PoseEstimate, odometer_m: float, room: Room) -> None:
+    def _decide_left(self, estimate: PoseEstimate, odometer_m: float, room: ScanRoom) -> None:
         waiting = self._trial.oldest  # what it saw is not counted yet: its tiles are not left
         frame = self._detector.local_map.grid_frame.frame
         p_map = (estimate if waiting is None else waiting).T_map_vehicle[:3, 3]
