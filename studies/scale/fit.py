@@ -16,7 +16,7 @@ from studies.scale.model import STREET, CloudModel, CpuCosts, HostRules, Said, S
 
 SEEDS: Final = (1, 2, 3)
 """Of which tiles are asked for; figures are medians over them."""
-ROUNDS: Final = 6
+ROUNDS: Final = 4
 """How often costs are taken anew from the merges that the model makes with them; they hardly change after the first."""
 NOTICE_SHARES: Final = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 QUANTILES: Final = {"p50": 0.5, "p95": 0.95}

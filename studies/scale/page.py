@@ -44,7 +44,7 @@ def page() -> str:
     loads, figures, given = Loads.read(), measured_figures(), ScaleParameters.read()
     fitted = fitted_stores(loads)
     told = [foretold(load, loads, fitted[kind]) for use in USES for kind in KINDS for load in loads.of(kind, use)]
-    of_region = replace(fitted["postgresql"].costs, publish_s=figures[PUBLISHED].value / 4e3)
+    of_region = replace(fitted["postgresql"].costs, publish_s=figures[PUBLISHED].value / 4e3, begin_s=0.0)
     shape = ReportShape.of(figures, loads.worker.again["settled"])
     use = costs_of_use(of_region, figures, light(of_region, shape))
     places = [planned(place, use, given) for place in given.place]
