@@ -38,7 +38,7 @@ from gnd.vehicle_agent.localise.stretch import (
     marginalised,
     solve_stretch,
 )
-from gnd.vehicle_agent.packed_rays import PlacedRays
+from gnd.vehicle_agent.packed_rays import PackedRays, PlacedRays
 from gnd.vehicle_agent.report.packing import pack, pack_measured
 from gnd.vehicle_agent.report.reporter import on_lattice
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
@@ -94,6 +94,8 @@ def _try(local_map: LocalMap, scans: list[RefinedScan]) -> None:
             pass
     for _ in trial.flush():
         pass
+    for scan in scans[:1]:
+        PackedRays.of(*scan.rays.restore()).restore()
 
 
 def _rolled(points_m: F64) -> None:

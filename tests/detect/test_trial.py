@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gate_scene import CORRIDOR, START_NS, WALLS, map_of, match_maps, scan, seen, shift
 
-from gnd.vehicle_agent.detect.trial import Trial, _standing
+from gnd.vehicle_agent.detect.trial import Trial
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.waiting import ScanRoom
 
@@ -142,12 +142,3 @@ def test_what_has_stood_but_was_not_given_yet_is_taken_back_too(yard: LocalMap, 
     assert numbers(one.flush()) == []
     assert one.counts["scans_taken_back"] == 2 * SEGMENT + 2 - len(counted)
     assert one.oldest is None
-
-
-@pytest.mark.parametrize("every", [1, 2, 3])
-@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_points_that_stand_are_those_that_numpy_picks(every: int, share: float) -> None:
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(101, 3)).astype(np.float32)
-    moving, off = rng.random(101) < share, np.array([1.0, -2.0, 0.5], np.float32)
-    np.testing.assert_array_equal(_standing(points, moving, every, off), points[~moving][::every] + off)

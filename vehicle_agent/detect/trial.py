@@ -14,8 +14,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import BOOL, F32, F64
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.arrays import F32, F64
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.detect.recent_map import recent_map
 from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, find_shift, gain
@@ -115,7 +114,7 @@ class _Recent:
         centre, some = self.scans[0].rays.centre_m, []
         for held in self.scans:
             off = (held.rays.centre_m - centre).astype(np.float32)
-            some.append(_standing(held.rays.points_m, held.moving, 1, np.zeros(3, np.float32))[::_EVERY_RECENT] + off)
+            some.append(held.rays.points_m[~held.moving][::_EVERY_RECENT] + off)
         return recent_map(np.concatenate(some), noise_m, centre, p_map_m, _MAX_RANGE_M)
 
 
@@ -267,24 +266,6 @@ class Trial:
             return shift.z
         z = gain(points_m, T, X_step @ T, recent)
         return max(shift.z, (shift.z + z) / math.sqrt(2.0)) if min(shift.z, z) > 0.0 else 0.0
-
-
-@kernel
-def _standing(points: F32, moving: BOOL, every: int, off: F32) -> F32:
-    """(K, 3) every so many of the points (N, 3) that do not move, moved by `off` (3,)."""
-    n = 0
-    for i in range(points.shape[0]):
-        n += not moving[i]
-    out, seen, k = np.empty(((n + every - 1) // every, 3), np.float32), 0, 0
-    for i in range(points.shape[0]):
-        if moving[i]:
-            continue
-        if seen % every == 0:
-            for axis in range(3):
-                out[k, axis] = points[i, axis] + off[axis]
-            k += 1
-        seen += 1
-    return out
 
 
 def some_of(points_m: F32, centre_map_m: F64, n: int) -> F64:
