@@ -70,6 +70,11 @@ def is_current(now: str) -> bool:
     return LIBRARY.is_file() and _MADE_OF.is_file() and _MADE_OF.read_text(encoding="utf-8") == now
 
 
+def has_library() -> bool:
+    """The same, asked in a process of its own: which kernels there are depends on what was imported."""
+    return subprocess.run([sys.executable, __file__, "--current"], check=False).returncode == 0
+
+
 def build_library(now: str) -> None:
     """Compile the library; where it cannot be (no C compiler), say so: programs of tests then run numba's, too."""
     LIBRARY.parent.mkdir(parents=True, exist_ok=True)
@@ -103,5 +108,7 @@ def main() -> None:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--library"]:
         build_library(sys.argv[2])
+    elif sys.argv[1:2] == ["--current"]:
+        sys.exit(not is_current(kernels_now()))
     else:
         main()
