@@ -199,9 +199,7 @@ def _refined(before: FittedStore, alone: CpuCosts, known: list[MeasuredLoad], lo
         rows.append((alone_s, float(np.median([run.merges for run in runs])), load.setting.shards))
         worth = before.unit_ms / load.unit_ms
         used_s.append(worth * load.cpu_s["workers"])
-        others_s += worth * (
-            load.client_cpu_s + sum(load.cpu_s.get(part, 0.0) for part in ("router", "store", "shards"))
-        )
+        others_s += worth * (load.client_cpu_s + sum(_spent([load], part) for part in ("router", "store", "shards")))
         versions[0] += load.versions
         versions[1] += float(np.median([run.versions for run in runs]))
     weight = np.array(used_s) ** -0.5  # a load with little to do says less than one with much

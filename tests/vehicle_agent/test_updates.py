@@ -1,6 +1,6 @@
 """Update notices over a real bus refresh the cache: by delta where it fits, by a download where not."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from vehicle_scene import ground, published
 from waiting import wait_until
 
 from gnd.fleet_bus.bus import Bus
+from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile import Tile, TileDelta, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import update_key
@@ -75,6 +76,24 @@ def cached(world: World) -> int:
 def download(world: World) -> None:
     world.fetcher.want([world.tile_id])
     wait_until(lambda: cached(world) > 0)
+
+
+def test_a_subscription_that_fails_is_tried_again_and_one_that_holds_is_not(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiles, asked = (world.tile_id,), list[Collection[str]]()
+
+    def fail(keys: Collection[str]) -> None:
+        asked.append(keys)
+        if len(asked) == 1:
+            raise GndError("no session")
+
+    monkeypatch.setattr(world.updates._notices, "follow", fail)
+    with pytest.raises(GndError, match="no session"):
+        world.updates.follow(tiles)
+    for _ in range(2):
+        world.updates.follow(tiles)
+    assert len(asked) == 2
 
 
 def test_a_delta_that_fits_makes_the_new_version(world: World) -> None:

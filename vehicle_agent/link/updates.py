@@ -49,9 +49,9 @@ class Updates(Generic[TileT]):
         """
         if tiles is self._followed:
             return
-        self._followed = tiles
         districts = sorted({tile.district for tile in tiles})
         self._notices.follow([update_keys(self._cache.layer, district.path) for district in districts])
+        self._followed = tiles  # not before: what has failed is tried again
 
     def close(self) -> None:
         """Listen to nothing any more."""
