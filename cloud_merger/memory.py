@@ -180,7 +180,8 @@ class TileMemory:
             head = json_value(data[4:at])
             if head["format"] not in (1, _FORMAT):
                 raise MergerError(f"a memory of format {head['format']}, this release reads 1 to {_FORMAT}")
-            n, rest = head["voxels"], memoryview(data)[at:]
+            rest = memoryview(data)[at:]
+            n, n_claims, n_parked = (_count(head.get(name, 0), rest) for name in ("voxels", "claims", "parked"))
             voxels = np.zeros(n, VOXEL)
             voxels["voxel_id"] = np.cumsum(np.frombuffer(rest[: 4 * n], "<i4"))
             first = 4 * n
@@ -188,8 +189,8 @@ class TileMemory:
                 size = VOXEL[name].itemsize * n
                 voxels[name] = np.frombuffer(rest[first : first + size], VOXEL[name])
                 first += size
-            claims = np.frombuffer(rest[first:], STATEMENT, head["claims"]).copy()
-            parked = np.frombuffer(rest[first + claims.nbytes :], PARKED, head.get("parked", 0)).copy()
+            claims = np.frombuffer(rest[first:], STATEMENT, n_claims).copy()
+            parked = np.frombuffer(rest[first + claims.nbytes :], PARKED, n_parked).copy()
             return cls(voxels, claims, tuple(Witness(**one) for one in head["witnesses"]), head["voters"], parked)
         except (ValueError, KeyError, TypeError) as error:
             raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
@@ -198,6 +199,13 @@ class TileMemory:
 def mark_of(vehicle: str) -> np.uint16:
     """What `last` remembers of a vehicle."""
     return np.uint16(crc32(vehicle.encode()) & 0xFFFF)
+
+
+def _count(number: Any, data: memoryview) -> int:
+    """A number of rows, each of a byte or more, in so many bytes; ValueError: it cannot be one."""
+    if type(number) is not int or not 0 <= number <= len(data):
+        raise ValueError(f"{number!r} rows in {len(data)} bytes")
+    return number
 
 
 def _told(witness: Witness) -> dict[str, Any]:
