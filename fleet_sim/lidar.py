@@ -17,9 +17,10 @@ from gnd.fleet_sim.errors import SceneError
 from gnd.fleet_sim.movers import Movers
 from gnd.fleet_sim.ray_kernels import FloatArray, IntArray, cast_sweep
 from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.return_kernels import ReturnRules, fill_returns
 from gnd.fleet_sim.sensing import Disturbance, SweepShots
 from gnd.fleet_sim.sensors import LidarModel
-from gnd.fleet_sim.shapes import reflectivity_of
+from gnd.fleet_sim.shapes import REFLECTIVITY
 
 _NS_PER_S: Final = 1_000_000_000
 _POINT_STEP_M: Final = 1.0 / 512
@@ -66,8 +67,8 @@ class Lidar:
         self.model = model
         self._directions = model.directions()
         self._shares = model.shares
-        self._times = model.shot_times_ns()
-        self._rings = np.broadcast_to(model.rings, self._times.shape)
+        self._times = model.shot_times_ns().astype(np.uint32)
+        self._rings = np.ascontiguousarray(np.broadcast_to(model.rings, self._times.shape))
 
     def hits(
         self,
@@ -96,7 +97,9 @@ class Lidar:
         T_street_lidar = scene.A_street_map @ T_map_lidar[:, 0:3, :]
         scene.check_inside(T_street_lidar[:, :, 3])
         poses = np.ascontiguousarray(T_street_lidar, dtype=np.float64)
-        met = cast_sweep(poses, self._directions, self._shares, self.model.range_max_m, *scene.arrays())
+        shape = self._times.shape
+        met = np.empty(shape), np.empty(shape, np.int32), np.empty(shape)
+        cast_sweep(poses, self._directions, self._shares, self.model.range_max_m, *scene.arrays(), *met)
         shots, cycle_s = (poses, self._directions, self._shares), self.model.cycle_ns / _NS_PER_S
         turn_rad, base = tau * cycle_s * self.model.rate_hz, len(scene.packed)
         if movers is not None:
@@ -126,28 +129,20 @@ class Lidar:
             poses = np.ascontiguousarray(scene.A_street_map @ T_map_lidar[:, 0:3, :], dtype=np.float64)
             shots = SweepShots(poses, self._directions, self._shares, self.model.range_max_m)
             disturbance.disturb(scene, packed, shots, t_s, (hits.range_m, hits.primitive, hits.incidence))
-        noisy = hits.range_m + self.model.range_sigma_m * rng.standard_normal(hits.range_m.shape)
-        seen = self._seen(packed, hits, rng) & (noisy >= self.model.range_min_m) & (noisy <= self.model.range_max_m)
-        points = self._directions[seen] * self._given(noisy[seen])[:, None]
-        points = np.round(points / _POINT_STEP_M) * _POINT_STEP_M
-        return Sweep(
-            points.astype(np.float32), self._times[seen].astype(np.uint32), self._rings[seen], hits.primitive[seen]
+        drawn = rng.standard_normal(hits.range_m.shape), rng.random(hits.range_m.shape)
+        return self._returns(hits, drawn, packed[:, REFLECTIVITY].copy())
+
+    def _returns(self, hits: Hits, drawn: tuple[FloatArray, FloatArray], reflectivity: FloatArray) -> Sweep:
+        """What comes back, with noise and loss as they are drawn (columns, beams)."""
+        m, shots = self.model, hits.range_m.size
+        rules = ReturnRules(
+            m.range_sigma_m, m.range_min_m, m.range_max_m, m.dark_m, 1.0 - m.loss, m.range_step_m, _POINT_STEP_M
         )
-
-    def _given(self, range_m: FloatArray) -> FloatArray:
-        """Round ranges to what the sensor gives."""
-        step = self.model.range_step_m
-        return np.asarray(np.round(range_m / step) * step) if step else range_m
-
-    def _seen(self, packed: FloatArray, hits: Hits, rng: np.random.Generator) -> NDArray[np.bool_]:
-        """Draw which returns come back.
-
-        The echo falls with reflectivity x cos(incidence) / range² (Lambert); it fades over ±10 % of the limit.
-        """
-        bright = reflectivity_of(packed, hits.primitive) * hits.incidence
-        limit = self.model.dark_m * np.sqrt(bright / 0.1)
-        chance = np.clip((1.1 * limit - hits.range_m) / (0.2 * limit + 1e-9), 0.0, 1.0) * (1.0 - self.model.loss)
-        return np.asarray((hits.primitive >= 0) & (rng.random(hits.range_m.shape) < chance))
+        points, t_offset_ns = np.empty((shots, 3), np.float32), np.empty(shots, np.uint32)
+        ring, primitive = np.empty(shots, np.uint8), np.empty(shots, np.int32)
+        met, table = (hits.range_m, hits.primitive, hits.incidence), (self._directions, self._times, self._rings)
+        n = fill_returns(met, drawn, reflectivity, table, rules, points, t_offset_ns, ring, primitive)
+        return Sweep(points[:n], t_offset_ns[:n], ring[:n], primitive[:n])
 
 
 def column_poses(model: LidarModel, t_start_s: float, pose_at: Callable[[FloatArray], FloatArray]) -> FloatArray:

@@ -97,10 +97,13 @@ class Movers:
 
     def at(self, t_s: FloatArray) -> FloatArray:
         """Return all states, float64 (M, K, 5), at times (K,) [s]; the plain twin of `ray_kernels.state_at`."""
-        tracks = self._crowd.tracks
-        samples = self.t0_s + self.step_s * np.arange(tracks.shape[1])
-        columns = [[np.interp(t_s, samples, track[:, k]) for k in range(STATE)] for track in tracks]
-        return np.moveaxis(np.array(columns), 1, 2)
+        tracks, last = self._crowd.tracks, self._crowd.tracks.shape[1] - 1
+        samples = self.t0_s + self.step_s * np.arange(last + 1)
+        within = np.clip(t_s, samples[0], samples[-1])
+        k = np.clip(np.searchsorted(samples, within, side="right") - 1, 0, last - 1)
+        slope = (tracks[:, k + 1] - tracks[:, k]) / (samples[k + 1] - samples[k])[:, None]
+        between = slope * (within - samples[k])[:, None] + tracks[:, k]
+        return np.asarray(np.where((within == samples[-1])[:, None], tracks[:, -1:], between))
 
     def under_way(self, t_s: float) -> NDArray[np.bool_]:
         """Return which primitives belong to a mover that moves at an instant, bool (P,)."""

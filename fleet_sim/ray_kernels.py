@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.fleet_sim.shapes import BALL, BLOCK, BOX, COLUMNS, POST
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -47,7 +47,7 @@ class RayGrid(NamedTuple):
     cell: float
 
 
-@kernel
+@bare
 def _meet_box(ray: Ray, inverse: tuple[float, float, float], p: FloatArray, k: int) -> float:
     """Range at which the ray enters the box from outside, inf if it does not (slabs, with 1/direction given)."""
     rx, ry = p[k + 1] - ray.ox, p[k + 2] - ray.oy
@@ -59,7 +59,7 @@ def _meet_box(ray: Ray, inverse: tuple[float, float, float], p: FloatArray, k: i
     return entry if 0.0 < entry <= leave else np.inf
 
 
-@kernel
+@bare
 def _clip(distance: float, speed: float, entry: float, leave: float) -> tuple[float, float]:
     """Clip [entry, leave] to the half-space where distance + t * speed <= 0."""
     if abs(speed) < _PARALLEL:
@@ -68,7 +68,7 @@ def _clip(distance: float, speed: float, entry: float, leave: float) -> tuple[fl
     return (max(entry, t), leave) if speed < 0.0 else (entry, min(leave, t))
 
 
-@kernel
+@bare
 def _meet_block(ray: Ray, p: FloatArray, k: int) -> float:
     """Range at which the ray enters the turned block with a sloping top from outside, inf if it does not."""
     c, s = p[k + 7], p[k + 8]
@@ -87,7 +87,7 @@ def _meet_block(ray: Ray, p: FloatArray, k: int) -> float:
     return entry if 0.0 < entry <= leave else np.inf
 
 
-@kernel
+@bare
 def _meet_post(ray: Ray, p: FloatArray, k: int) -> float:
     """Range at which the ray enters the vertical cylinder from outside, inf if it does not."""
     rx, ry = ray.ox - p[k + 1], ray.oy - p[k + 2]
@@ -106,7 +106,7 @@ def _meet_post(ray: Ray, p: FloatArray, k: int) -> float:
     return entry if 0.0 < entry <= leave else np.inf
 
 
-@kernel
+@bare
 def _meet_ball(ray: Ray, p: FloatArray, k: int) -> float:
     """Range at which the ray enters the sphere from outside, inf if it does not."""
     rx, ry, rz = ray.ox - p[k + 1], ray.oy - p[k + 2], ray.oz - p[k + 3]
@@ -118,13 +118,13 @@ def _meet_ball(ray: Ray, p: FloatArray, k: int) -> float:
     return entry if entry > 0.0 else np.inf
 
 
-@kernel
+@bare
 def _inverse(d: float) -> float:
     """1/d, huge instead of infinite where the ray runs along a face (0 * inf is no number)."""
     return 1.0 / d if abs(d) > _PARALLEL else 1.0 / _PARALLEL
 
 
-@kernel
+@bare
 def cast_ray(
     ray: Ray, range_m: float, p: FloatArray, starts: IntArray, items: IntArray, tops: FloatArray, grid: RayGrid
 ) -> tuple[float, int]:
@@ -169,7 +169,7 @@ def cast_ray(
     return (best, found) if found >= 0 else (np.inf, -1)
 
 
-@kernel
+@bare
 def incidence_of(ray: Ray, t: float, p: FloatArray, item: int) -> float:
     """Cosine of the angle between a ray and the normal of the surface of primitive `item` that it met at range t."""
     k = item * COLUMNS
@@ -193,7 +193,7 @@ def incidence_of(ray: Ray, t: float, p: FloatArray, item: int) -> float:
     return float(abs(down) / (length * sqrt(1.0 + rise_x * rise_x + rise_y * rise_y)))
 
 
-@kernel
+@bare
 def cast_rays(
     origins: FloatArray,
     directions: FloatArray,
@@ -203,17 +203,19 @@ def cast_rays(
     items: IntArray,
     tops: FloatArray,
     grid: RayGrid,
-) -> tuple[FloatArray, IntArray]:
-    """Cast N rays from origins (N, 3) along directions (N, 3), both in the street frame: ranges and primitives (N,)."""
-    ranges, index = np.empty(len(directions)), np.empty(len(directions), np.int32)
+    ranges: FloatArray,
+    index: IntArray,
+) -> None:
+    """Cast N rays from origins (N, 3) along directions (N, 3), both in the street frame: fills ranges and primitives
+    (N,).
+    """
     for i in range(len(directions)):
         o, d = origins[i], directions[i]
         ray = Ray(o[0], o[1], o[2], d[0], d[1], d[2])
         ranges[i], index[i] = cast_ray(ray, range_m, p, starts, items, tops, grid)
-    return ranges, index
 
 
-@kernel
+@bare
 def cast_fan(
     origin: FloatArray,
     directions: FloatArray,
@@ -223,17 +225,19 @@ def cast_fan(
     items: IntArray,
     tops: FloatArray,
     grid: RayGrid,
-) -> tuple[FloatArray, IntArray]:
-    """Cast rays from one origin (3,) along directions (N, 3), each with its own reach (N,): ranges and primitives."""
-    ranges, index = np.empty(len(directions)), np.empty(len(directions), np.int32)
+    ranges: FloatArray,
+    index: IntArray,
+) -> None:
+    """Cast rays from one origin (3,) along directions (N, 3), each with its own reach (N,): fills ranges and
+    primitives (N,).
+    """
     for i in range(len(directions)):
         d = directions[i]
         ray = Ray(origin[0], origin[1], origin[2], d[0], d[1], d[2])
         ranges[i], index[i] = cast_ray(ray, reach_m[i], p, starts, items, tops, grid)
-    return ranges, index
 
 
-@kernel
+@bare
 def shot(pose: FloatArray, following: FloatArray, share: float, d: FloatArray) -> Ray:
     """The ray of a shot along d (3,), lidar frame, that leaves at a share of the way between two poses (3, 4).
 
@@ -251,7 +255,7 @@ def shot(pose: FloatArray, following: FloatArray, share: float, d: FloatArray) -
     return Ray(ox, oy, oz, dx, dy, dz)
 
 
-@kernel
+@bare
 def cast_sweep(
     poses: FloatArray,
     directions: FloatArray,
@@ -262,21 +266,22 @@ def cast_sweep(
     items: IntArray,
     tops: FloatArray,
     grid: RayGrid,
-) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Cast directions (columns, beams, 3) from poses (columns + 1, 3, 4), both towards the street frame.
+    ranges: FloatArray,
+    found: IntArray,
+    incidence: FloatArray,
+) -> None:
+    """Cast directions (columns, beams, 3) from poses (columns + 1, 3, 4), both towards the street frame, and fill
+    ranges, primitives and cosines of incidence (columns, beams).
 
     Beam j leaves at the fraction shares[j] of its cycle.
     """
     columns, beams = directions.shape[0], directions.shape[1]
-    ranges, found = np.empty((columns, beams)), np.empty((columns, beams), np.int32)
-    incidence = np.empty((columns, beams))
     for i in range(columns):
         for j in range(beams):
             ray = shot(poses[i], poses[i + 1], shares[j], directions[i, j])
             ranges[i, j], found[i, j] = cast_ray(ray, range_m, p, starts, items, tops, grid)
             met = found[i, j] >= 0
             incidence[i, j] = incidence_of(ray, ranges[i, j], p, found[i, j]) if met else 1.0
-    return ranges, found, incidence
 
 
 class Crowd(NamedTuple):
@@ -304,7 +309,7 @@ class Crowd(NamedTuple):
     reach_m: float
 
 
-@kernel
+@bare
 def state_at(crowd: Crowd, mover: int, t_s: float) -> tuple[float, float, float, float, float]:
     """Where a mover is at an instant: x, y, z, yaw, stride; before and after its track it stands at the end of it."""
     last = crowd.tracks.shape[1] - 1
@@ -320,7 +325,7 @@ def state_at(crowd: Crowd, mover: int, t_s: float) -> tuple[float, float, float,
     )
 
 
-@kernel
+@bare
 def _meet_primitive(ray: Ray, inverse: tuple[float, float, float], p: FloatArray, k: int) -> float:
     """Range at which the ray enters the primitive packed at p[k:] from outside, inf if it does not.
 
@@ -335,7 +340,7 @@ def _meet_primitive(ray: Ray, inverse: tuple[float, float, float], p: FloatArray
     return _meet_post(ray, p, k)
 
 
-@kernel
+@bare
 def _near_ball(ray: Ray, range_m: float, x: float, y: float, z: float, reach: float) -> bool:
     """Whether a ray comes into a ball within range."""
     rx, ry, rz = x - ray.ox, y - ray.oy, z - ray.oz
@@ -347,7 +352,7 @@ def _near_ball(ray: Ray, range_m: float, x: float, y: float, z: float, reach: fl
     return along > 0.0 and away * dd <= along * along and (before <= 0.0 or before * before <= reach * reach * dd)
 
 
-@kernel
+@bare
 def meet_mover(ray: Ray, range_m: float, crowd: Crowd, mover: int, t_s: float) -> tuple[float, int, float]:
     """Range, primitive and cosine of incidence where a ray shot at an instant first meets a mover, (inf, -1, 1) if not.
 
@@ -367,7 +372,7 @@ def meet_mover(ray: Ray, range_m: float, crowd: Crowd, mover: int, t_s: float) -
     return (best, found, incidence) if found >= 0 else (np.inf, -1, 1.0)
 
 
-@kernel
+@bare
 def _faces(pose: FloatArray, direction: FloatArray, x: float, y: float, reach: float, spread: float) -> bool:
     """Whether shots may touch a ball seen from above; `spread` is the sine of how far they fan out from `direction`."""
     rx, ry = x - pose[0, 3], y - pose[1, 3]
@@ -379,7 +384,7 @@ def _faces(pose: FloatArray, direction: FloatArray, x: float, y: float, reach: f
     return away <= wide or (rx * dx + ry * dy > 0.0 and abs(rx * dy - ry * dx) <= wide * flat)
 
 
-@kernel
+@bare
 def cast_crowd(
     poses: FloatArray,
     directions: FloatArray,
@@ -419,7 +424,7 @@ def cast_crowd(
                         ranges[i, j], found[i, j], incidence[i, j] = t, base + item, cosine
 
 
-@kernel
+@bare
 def _mixed(value: np.uint64) -> np.uint64:
     """Scramble the bits of a counter (splitmix64, Steele et al. 2014): neighbours give independent numbers."""
     value = value + np.uint64(0x9E3779B97F4A7C15)
@@ -428,7 +433,7 @@ def _mixed(value: np.uint64) -> np.uint64:
     return value ^ (value >> np.uint64(31))
 
 
-@kernel
+@bare
 def _within_crown(ray: Ray, v: FloatArray) -> tuple[float, float]:
     """Ranges at which the ray enters and leaves the ellipsoid v (x, y, z, half axes); leave < entry if it misses."""
     rx, ry, rz = (ray.ox - v[0]) / v[3], (ray.oy - v[1]) / v[4], (ray.oz - v[2]) / v[5]
@@ -440,7 +445,7 @@ def _within_crown(ray: Ray, v: FloatArray) -> tuple[float, float]:
     return (-b - sqrt(root)) / a, (-b + sqrt(root)) / a
 
 
-@kernel
+@bare
 def _within_hedge(ray: Ray, v: FloatArray) -> tuple[float, float]:
     """Ranges at which the ray enters and leaves the upright box v (x, y, z, half edges); leave < entry if it misses."""
     entry, leave = _clip(ray.ox - v[0] - v[3], ray.dx, -np.inf, np.inf)
@@ -451,7 +456,7 @@ def _within_hedge(ray: Ray, v: FloatArray) -> tuple[float, float]:
     return _clip(v[2] - v[5] - ray.oz, -ray.dz, entry, leave)
 
 
-@kernel
+@bare
 def cast_leaves(
     poses: FloatArray,
     directions: FloatArray,

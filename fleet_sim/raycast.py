@@ -85,7 +85,17 @@ class Scene:
             raise SceneError(f"directions must be (N, 3), got {directions.shape}")
         start = np.ascontiguousarray(np.broadcast_to(origins @ self.A_street_map.T, directions.shape))
         self.check_inside(start)
-        return cast_rays(start, directions @ self.A_street_map.T, range_m, *self.arrays())
+        return self.cast_in_street(start, directions @ self.A_street_map.T, range_m)
+
+    def cast_in_street(
+        self, origins: FloatArray, directions: FloatArray, range_m: float
+    ) -> tuple[FloatArray, IntArray]:
+        """As `cast`, of origins and directions float64 (N, 3) that are images in the street frame, and whose origins
+        are known to lie inside.
+        """
+        met = np.empty(len(directions)), np.empty(len(directions), np.int32)
+        cast_rays(origins, directions, range_m, *self.arrays(), *met)
+        return met
 
     def cast_fan(self, origin: FloatArray, directions: FloatArray, reach_m: FloatArray) -> tuple[FloatArray, IntArray]:
         """As `cast`, of N rays from one place (3,), each with its own reach (N,), all in the frame of the shapes.
@@ -96,7 +106,9 @@ class Scene:
             SceneError: the origin lies outside the grid of the scene.
         """
         self.check_inside(origin[None, :])
-        return cast_fan(origin, directions, reach_m, *self.arrays())
+        met = np.empty(len(directions)), np.empty(len(directions), np.int32)
+        cast_fan(origin, directions, reach_m, *self.arrays(), *met)
+        return met
 
     def holds(self, points_street: FloatArray) -> NDArray[np.bool_]:
         """Return which points (N, 3) lie inside the grid, bool (N,): rays may start there."""

@@ -15,7 +15,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.fleet_sim.ray_kernels import FloatArray, IntArray, cast_rays
+from gnd.fleet_sim.ray_kernels import FloatArray, IntArray
 from gnd.fleet_sim.raycast import Scene
 from gnd.fleet_sim.shapes import COLUMNS
 from gnd.fleet_sim.world import State, World
@@ -155,7 +155,7 @@ def _mirrored(scene: Scene, shots: SweepShots, picked: Picked, near_m: FloatArra
     inside = scene.holds(start)
     further = np.full(len(near_m), np.inf)
     if inside.any():
-        met, _ = cast_rays(start[inside], turned[inside], shots.range_m, *scene.arrays())
+        met, _ = scene.cast_in_street(start[inside], turned[inside], shots.range_m)
         further[inside] = met
     return np.asarray(near_m + further)
 

@@ -22,6 +22,8 @@ BOX: Final = 3
 
 COLUMNS: Final = 13
 """Columns of a packed primitive; their meaning depends on the kind in column 0 (see `pack`)."""
+REFLECTIVITY: Final = COLUMNS - 1
+"""The column of that."""
 
 
 def _check(shape: object, values: Sequence[float], positive: dict[str, float], reflectivity: float) -> None:
@@ -153,9 +155,3 @@ def pack(shapes: Sequence[Shape]) -> NDArray[np.float64]:
     """Return the primitives as one float64 array (M, 13): kind, ten numbers of its own, highest point, reflectivity."""
     rows = [(*shape.packed(), shape.bounds()[4], shape.reflectivity) for shape in shapes]
     return np.array(rows, dtype=np.float64).reshape(len(rows), COLUMNS)
-
-
-def reflectivity_of(packed: NDArray[np.float64], index: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return the reflectivity (N,) of the primitives that N rays met; 1 where `index` is -1."""
-    found = packed[np.maximum(index, 0), COLUMNS - 1] if len(packed) else np.ones(index.shape)
-    return np.where(index >= 0, found, 1.0)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from gnd.gnd_map.arrays import F64, I64, Array, check_array, points_3d
 from gnd.gnd_map.errors import MotionError
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import bare, kernel
 from gnd.gnd_map.se3 import T_inverse, interpolate_poses
 
 TOLERANCE_NS = 100_000_000  # one sweep at 10 Hz: its last points come after its last pose
@@ -82,7 +82,9 @@ def deskew(
     first, knots_ns = _knots(offset)
     T_reference_dst = T_inverse(poses.at(reference_ns))
     T_reference_lidar = T_reference_dst @ poses.at(sweep_t_ns + knots_ns) @ T_vehicle_lidar
-    return _blend(points, offset - first, np.ascontiguousarray(T_reference_lidar[:, :3, :]), _KNOT_NS)
+    out = np.empty_like(points)
+    _blend(points, offset, first, np.ascontiguousarray(T_reference_lidar[:, :3, :]), _KNOT_NS, out)
+    return out
 
 
 @kernel
@@ -147,13 +149,13 @@ def _knots(offset_ns: I64) -> tuple[int, I64]:
     return first, first + _KNOT_NS * np.arange(int(offset_ns.max() - first) // _KNOT_NS + 2)
 
 
-@kernel
-def _blend(points: F64, offset_ns: I64, poses: F64, knot_ns: int) -> F64:
-    """Each point under the pose blended between the two knots around its time."""
-    out = np.empty_like(points)
+@bare
+def _blend(points: F64, offset_ns: I64, first_ns: int, poses: F64, knot_ns: int, out: F64) -> None:
+    """Fill `out` with each point under the pose blended between the two knots around its time."""
     for i in range(points.shape[0]):
-        k = offset_ns[i] // knot_ns
-        after = (offset_ns[i] - k * knot_ns) / knot_ns
+        since_ns = offset_ns[i] - first_ns
+        k = since_ns // knot_ns
+        after = (since_ns - k * knot_ns) / knot_ns
         before = 1.0 - after
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for row in range(3):
@@ -161,4 +163,3 @@ def _blend(points: F64, offset_ns: I64, poses: F64, knot_ns: int) -> F64:
             out[i, row] = before * (a[0] * x + a[1] * y + a[2] * z + a[3]) + after * (
                 b[0] * x + b[1] * y + b[2] * z + b[3]
             )
-    return out

@@ -179,7 +179,8 @@ class MoverLabels:
         if not labels or len(labels[0]) != len(segmented.moving):
             return
         scan, said = segmented.scan, segmented.moving
-        near = np.linalg.norm(scan.points_map_m - scan.origins_map_m, axis=1) <= self._range_m
+        x, y, z = (scan.points_map_m - scan.origins_map_m).T
+        near = np.sqrt(x * x + y * y + z * z) <= self._range_m
         true, said = labels[0][near], said[near]
         found = (true.sum(), (true & ~said).sum(), (~true).sum(), (~true & said).sum())
         self.counts.update(dict(zip(COUNTS, map(int, found), strict=True)))

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from gnd.fleet_sim.lidar import Hits, Lidar
 from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
 
 
@@ -75,3 +76,20 @@ def plain_range(shapes: list[Shape], o: np.ndarray, d: np.ndarray, range_m: floa
         if 0 < entry <= leave:
             best = min(best, entry)
     return best if best < range_m else math.inf
+
+
+def plain_returns(
+    lidar: Lidar, hits: Hits, packed: np.ndarray, drawn: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Points, times, rings and primitives of what comes back, all shots at once: the plain twin of `fill_returns`."""
+    model, (normal, even), met = lidar.model, drawn, hits.primitive >= 0
+    noisy = hits.range_m + model.range_sigma_m * normal
+    bright = np.where(met, packed[np.maximum(hits.primitive, 0), 12], 1.0) * hits.incidence
+    limit = model.dark_m * np.sqrt(bright / 0.1)
+    chance = np.clip((1.1 * limit - hits.range_m) / (0.2 * limit + 1e-9), 0.0, 1.0) * (1.0 - model.loss)
+    seen = met & (even < chance) & (noisy >= model.range_min_m) & (noisy <= model.range_max_m)
+    step = model.range_step_m
+    given = np.round(noisy[seen] / step) * step if step else noisy[seen]
+    points = np.round(model.directions()[seen] * given[:, None] * 512.0) / 512.0
+    rings = np.broadcast_to(model.rings, met.shape)
+    return points.astype(np.float32), model.shot_times_ns()[seen], rings[seen], hits.primitive[seen]

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from plain_caster import plain_returns
 
 from gnd.fleet_sim.errors import SceneError
 from gnd.fleet_sim.lidar import Lidar, Sweep, column_poses
@@ -38,6 +39,23 @@ def test_a_standing_sensor_sees_the_room_as_plain_casting_does(name: str) -> Non
     ranges, index = scene.cast(T[:3, 3], model.directions().reshape(-1, 3), model.range_max_m)
     np.testing.assert_allclose(hits.range_m.ravel(), ranges, rtol=1e-12)
     np.testing.assert_array_equal(hits.primitive.ravel(), index)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_returns_are_those_of_the_plain_twin_to_the_bit(name: str) -> None:
+    """In a room that fades: dark things at the end of what the sensor sees, and too near ones."""
+    shapes = [*ROOM, Block(1.3, -1.0, 0.1, 0.3, 1.0, 2.5), Block(-60.0, 0.0, 1.0, 90.0, 0.0, 30.0, reflectivity=0.03)]
+    shapes = [one for one in shapes if one != ROOM[2]]
+    scene, lidar = Scene.build(shapes), Lidar(MODELS[name])
+    poses = standing(lidar.model, at(0.5, -1.0, 1.9))
+    sweep, rng = lidar.sweep(scene, poses, np.random.default_rng(4)), np.random.default_rng(4)
+    shape = lidar.model.shot_times_ns().shape
+    drawn = rng.standard_normal(shape), rng.random(shape)
+    twin = plain_returns(lidar, lidar.hits(scene, poses), scene.packed, drawn)
+    found = sweep.points_lidar_m, sweep.t_offset_ns, sweep.ring, sweep.primitive
+    assert 0.05 * drawn[0].size < len(sweep.ring) < drawn[0].size
+    for ours, plain in zip(found, twin, strict=True):
+        np.testing.assert_array_equal(ours, plain)
 
 
 def test_incidence_is_the_cosine_to_the_surface_normal() -> None:

@@ -151,8 +151,9 @@ def _look(
     beyond, nearer, same = False, False, False
     columns, rows = image.shape
     for c in range(column - across, column + across + 1):
+        at = c + columns if c < 0 else (c - columns if c >= columns else c)  # a division would cost as much as a cell
         for q in range(max(0, low), min(rows, high + 1)):
-            seen = int(image[c % columns, q])
+            seen = int(image[at, q])
             if seen == 0:
                 continue
             cm = seen & FAR_CM
