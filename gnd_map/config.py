@@ -8,11 +8,22 @@ import dataclasses
 import enum
 import types
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from gnd.gnd_map.errors import ConfigError
 
 T = TypeVar("T")
+
+_HINTS: Final[dict[type, dict[str, Any]]] = {}
+
+
+def type_hints(cls: type) -> dict[str, Any]:
+    """The types of a class's fields. Their texts are evaluated once: to do it at each call takes longer than to read a
+    file of settings.
+    """
+    if cls not in _HINTS:
+        _HINTS[cls] = get_type_hints(cls)
+    return _HINTS[cls]
 
 
 def from_mapping(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") -> T:
@@ -35,7 +46,7 @@ def from_mapping(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") -
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
     _refuse_unknown(set(mapping) - set(fields), fields, where or cls.__name__)
     _refuse_missing(fields, mapping, where or cls.__name__)
-    hints = get_type_hints(cls)
+    hints = type_hints(cls)
     values = {name: _convert(hints[name], value, _join(where, name)) for name, value in mapping.items()}
     try:
         return cast("T", cls(**values))

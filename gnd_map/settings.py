@@ -11,10 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from hashlib import sha256
-from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin
 
 from gnd.gnd_map.bounded import json_value
-from gnd.gnd_map.config import from_mapping, to_mapping
+from gnd.gnd_map.config import from_mapping, to_mapping, type_hints
 from gnd.gnd_map.errors import ConfigError
 
 T = TypeVar("T")
@@ -126,7 +126,7 @@ def described(cls: type[Any], prefix: str = "", *, default: object = None) -> It
         prefix: path of the group.
         default: a value of `cls` whose fields are the defaults; None: those of the class.
     """
-    hints = get_type_hints(cls)
+    hints = type_hints(cls)
     for each in dataclasses.fields(cls):
         told: Setting | None = each.metadata.get(_KEY)
         if told is None:
@@ -326,7 +326,7 @@ def _refuse_unknown_path(cls: type[Any], keys: Sequence[str], origin: str) -> No
             near = get_close_matches(path, names, 3, 0.6) or [n for n in names if n.split(".")[-1] == keys[-1]][:3]
             hint = f"did you mean {', '.join(near)}?" if near else f"known here: {', '.join(fields)}"
             raise ConfigError(f"{origin}: there is no setting {path}; {hint}")
-        hint_type = get_type_hints(group)[key]
+        hint_type = type_hints(group)[key]
         group = None if get_origin(hint_type) is tuple else _group_of(hint_type)
 
 
