@@ -11,7 +11,7 @@ from gnd.fleet_bus.part import Part
 from gnd.fleet_bus.requesting import RetryPolicy
 from gnd.fleet_bus.sealing import CERTIFICATE_ROOT
 from gnd.fleet_bus.seals import PUBLISHERS
-from gnd.fleet_bus.serving import Handler, Serving, TurnOf
+from gnd.fleet_bus.serving import Concerns, Handler, Serving, TurnOf
 from gnd.fleet_bus.subscribing import (
     AliveToken,
     AliveWatch,
@@ -160,6 +160,7 @@ class Bus:
         kind: str = "control",
         beside: Serving | None = None,
         turn_of: TurnOf | None = None,
+        concerns: Concerns | None = None,
     ) -> Serving:
         """Answers requests in threads of our own, so that a handler may itself ask, wait or compute.
 
@@ -174,6 +175,8 @@ class Bus:
             kind: ledger kind of requests and answers.
             beside: a handler that lives longer: its threads answer, and `workers` is not looked at.
             turn_of: whose a request is, of its key and payload: askers are served in turn; None: by key.
+            concerns: whether a question is one for this handler, of its key and payload, asked before its seal is
+                looked at; None: each is.
         """
         self._connection.check_open()
         serving = Serving(
@@ -185,6 +188,7 @@ class Bus:
             kind=kind,
             beside=beside,
             turn_of=turn_of,
+            concerns=concerns,
         )
         return self.keep(serving)
 

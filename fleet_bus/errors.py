@@ -11,6 +11,7 @@ BusError
 ├── RequestFailed       no answer before the deadline
 │   └── RequestRefused  the other side answered: never
 ├── SealError           a message whose seal is missing, does not fit or is of the wrong part
+│   ├── ClocksDiffer    a seal or a certificate that does not count at this time, by the clock of here
 │   └── NotAnsweredFor  a tile version that no publisher answers for
 ├── NotMine, Refused, Busy
 │                       raised by handlers: what they say to the asker
@@ -77,6 +78,12 @@ class RequestRefused(RequestFailed):
 
 class SealError(BusError):
     """A message is not sealed, or not by who may say it; a certificate is not one of the authority."""
+
+
+class ClocksDiffer(SealError):
+    """A seal or a certificate that does not count at this time, by the clock of here: one of two clocks may be wrong,
+    and then it counts later.
+    """
 
 
 class NotAnsweredFor(SealError):

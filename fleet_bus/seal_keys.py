@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gnd.fleet_bus.errors import IdentityError, SealError
+from gnd.fleet_bus.errors import ClocksDiffer, IdentityError, SealError
 from gnd.fleet_bus.remembered import FILE, RememberedChains
 from gnd.fleet_bus.seals import Holder, Signer, certificate_id
 
@@ -46,7 +46,8 @@ class KnownCertificates:
         """Whom a certificate names that was shown before; None = it was not.
 
         Raises:
-            SealError: it has ended, or was revoked.
+            ClocksDiffer: it has ended.
+            SealError: it was revoked.
         """
         return self._holder(certificate_id) or self._recall(certificate_id)
 
@@ -61,14 +62,15 @@ class KnownCertificates:
             if serials & self._revoked:
                 raise SealError(f"the certificate of {holder} was revoked")
         if holder.ends_s < time.time():
-            raise SealError(f"the certificate of {holder} ended {time.time() - holder.ends_s:.0f} s ago")
+            raise ClocksDiffer(f"the certificate of {holder} ended {time.time() - holder.ends_s:.0f} s ago")
         return holder
 
     def learn(self, chain: bytes) -> Holder:
         """Take a certificate with those between it and the authority.
 
         Raises:
-            SealError: the authority has not signed it, it is not valid now, or was revoked.
+            ClocksDiffer: it is not valid now.
+            SealError: the authority has not signed it, or it was revoked.
         """
         holder, serials = holder_of_chain(chain, self._authority)
         with self._lock:
@@ -144,7 +146,8 @@ def holder_of_chain(chain: bytes, authority: Sequence["x509.Certificate"]) -> tu
     """Whom a chain of certificates names, and their serial numbers.
 
     Raises:
-        SealError: it cannot be read, the authority has not signed it, it is not valid now, or names no part of a fleet.
+        ClocksDiffer: it is not valid now.
+        SealError: it cannot be read, the authority has not signed it, or it names no part of a fleet.
     """
     from cryptography import x509
     from cryptography.exceptions import UnsupportedAlgorithm
@@ -203,7 +206,7 @@ def _check_chain(chain: Sequence["x509.Certificate"], authority: Sequence["x509.
         begins_s, ends_s = one.not_valid_before_utc.timestamp(), one.not_valid_after_utc.timestamp()
         if not begins_s <= now_s <= ends_s:
             late = "has ended" if now_s > ends_s else "is not valid yet: check the clocks"
-            raise SealError(f"a certificate of {one.subject.rfc4514_string()[:120]} {late}")
+            raise ClocksDiffer(f"a certificate of {one.subject.rfc4514_string()[:120]} {late}")
         if (position > 0) != may_sign(one):
             raise SealError(f"{one.subject.rfc4514_string()[:120]} has another place in the chain")
     links = pairwise(chain)

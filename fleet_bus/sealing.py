@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from gnd.fleet_bus.agreed_keys import AgreedKey, GrantedKeys, HeldKeys, KeyHalf, under_terse
-from gnd.fleet_bus.errors import BusError, NotMine, SealError
+from gnd.fleet_bus.errors import BusError, ClocksDiffer, NotMine, SealError
 from gnd.fleet_bus.seal_keys import KnownCertificates, certificates_of, holder_of, load_authority, load_signer
 from gnd.fleet_bus.seals import (
     ANSWERED_BY,
@@ -211,6 +211,7 @@ class Sealing:
         Raises:
             CertificateWanted: the certificate is not known here.
             SignatureWanted: its short seal does not count.
+            ClocksDiffer: it does not count now.
             SealError: the question does not count.
         """
         if is_short(attachment):
@@ -228,9 +229,9 @@ class Sealing:
         if wanted is None:
             return HeardQuestion(None, digest, share=seal.share)
         if abs(time.time() - seal.time_ms / 1000) > MOST_SKEW_S:
-            raise SealError(
+            raise ClocksDiffer(
                 f"a question that was sealed {time.time() - seal.time_ms / 1000:.0f} s ago, the limit is"
-                f" {MOST_SKEW_S:.0f} s: check the vehicle's clock"
+                f" {MOST_SKEW_S:.0f} s: check the vehicle's clock, and that of {self.own}"
             )
         holder = self._certificates.learn(seal.chain) if seal.chain else self._certificates.holder(seal.certificate_id)
         if holder is None:

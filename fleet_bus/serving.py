@@ -10,7 +10,7 @@ import zenoh
 from gnd.fleet_bus.config import QUEUE_LIMIT
 from gnd.fleet_bus.connection import Connection
 from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, attachment_bytes, head_bytes
-from gnd.fleet_bus.errors import BusClosed, BusError, Busy, NotMine, Refused, SealError
+from gnd.fleet_bus.errors import BusClosed, BusError, Busy, ClocksDiffer, NotMine, Refused, SealError
 from gnd.fleet_bus.part import Part
 from gnd.fleet_bus.refusals import counted
 from gnd.fleet_bus.requesting import (
@@ -58,9 +58,15 @@ Handler = Callable[[Request], Answer]
 TurnOf = Callable[[str, bytes], str]
 """Whose a request is, of its key and payload: called in zenoh's thread, so it has to be short."""
 
+Concerns = Callable[[str, bytes], bool]
+"""Whether a question is one to answer here, of its key and payload."""
+
 REGIONS_WAITING: Final = 64
 FULL_RETRY_S: Final = 1.0
 """Who finds a full mailbox is to ask again after so long."""
+CLOCK_RETRY_S: Final = 10.0
+"""Whose seal or certificate does not count by the clock of here is to ask again after so long: each time costs it the
+whole message, and somebody has to set a clock."""
 # Answers to a region leave no faster, so that they do not fill the queue of an asker with an ordinary link.
 REGION_BYTE_S: Final = 8_000_000
 
@@ -80,6 +86,7 @@ class Serving(Part):
     Questions about regions have one thread and a short mailbox of their own: nobody who asks for one thing waits for
     somebody who asks for everything. One that serves `beside` another has the threads and the mailbox of that one.
     Within a mailbox askers are served in turn, as `turn_of` tells them apart: by their keys, if nothing else is said.
+    What does not concern it, it says nothing to, not even that a seal does not count here.
     """
 
     def __init__(
@@ -93,9 +100,10 @@ class Serving(Part):
         kind: str,
         beside: "Serving | None" = None,
         turn_of: TurnOf | None = None,
+        concerns: Concerns | None = None,
     ) -> None:
         super().__init__()
-        self._turn_of = turn_of or _key_of
+        self._turn_of, self._concerns = turn_of or _key_of, concerns
         self._is_retired = False
         self._connection, self._handler, self._kind = connection, handler, kind
         self._own: list[InTurn[_Asked]] = []
@@ -155,23 +163,19 @@ class Serving(Part):
 
     def _reply(self, query: zenoh.Query) -> None:
         key, payload = str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b""
+        if self._concerns is not None and not self._concerns(key, payload):
+            raise NotMine
         attachment = query.attachment.to_bytes() if query.attachment is not None else b""
         head = head_bytes(key, REQUEST_BYTES) + attachment_bytes(query.attachment)
         self._connection.incoming(payload, self._kind, None, head_bytes=head)
-        heard = HeardQuestion(None, b"")
-        sealing = self._connection.sealing
-        if sealing is not None:
-            try:
-                heard = sealing.check_question(key, payload, attachment, id(self))
-            except CertificateWanted:
-                raise
-            except SealError as error:
-                sealing.note_refused(key, error)
-                if isinstance(error, SignatureWanted):
-                    raise
-                heard = HeardQuestion(None, question_digest(key, payload, number_of(attachment)))
-                self._refuse(query, key, str(error), heard, attachment)
-                return
+        try:
+            heard = self._heard(key, payload, attachment)
+        except (CertificateWanted, SignatureWanted):
+            raise
+        except SealError as error:
+            heard = HeardQuestion(None, question_digest(key, payload, number_of(attachment)))
+            self._refuse(query, key, str(error), heard, attachment)
+            return
         request = Request(key, payload, heard.asker, heard.binds)
         try:
             answer = self._handler(request)
@@ -189,6 +193,27 @@ class Serving(Part):
         # To a program that knows only zenoh an error would mean that its question had failed.
         if attachment == COUNT_WANTED or wants_count(attachment):
             query.reply_err(str(count), encoding=END_OF_ANSWERS)
+
+    def _heard(self, key: str, payload: bytes, attachment: bytes) -> HeardQuestion:
+        """Who asks, where seals are demanded.
+
+        Raises:
+            CertificateWanted, SignatureWanted: another attempt may count.
+            Busy: it may count later.
+            SealError: it does not count.
+        """
+        sealing = self._connection.sealing
+        if sealing is None:
+            return HeardQuestion(None, b"")
+        try:
+            return sealing.check_question(key, payload, attachment, id(self))
+        except CertificateWanted:
+            raise
+        except SealError as error:
+            sealing.note_refused(key, error)
+            if isinstance(error, ClocksDiffer):  # refused for good, a report would be given up by its vehicle
+                raise Busy(str(error), CLOCK_RETRY_S, "clock") from None
+            raise
 
     def _refuse(self, query: zenoh.Query, key: str, why: str, heard: HeardQuestion, attachment: bytes) -> None:
         """Say that there will be no answer, sealed to who looks at seals."""

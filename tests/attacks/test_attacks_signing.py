@@ -13,6 +13,7 @@ import zenoh
 from signing_scene import HOUR, NOW, Authority
 from suite_ports import new_port
 
+from gnd.fleet_bus import sealing as sealing_module
 from gnd.fleet_bus import seals
 from gnd.fleet_bus.agreed_keys import KEYS_A_MEMBER, REPLAY_WINDOW, AgreedKey, GrantedKeys, KeyHalf
 from gnd.fleet_bus.bus import Bus, open_bus
@@ -23,7 +24,7 @@ from gnd.fleet_bus.requesting import END_OF_ANSWERS, REFUSED, SIGNATURE_WANTED, 
 from gnd.fleet_bus.router import open_router
 from gnd.fleet_bus.seal_keys import load_signer
 from gnd.fleet_bus.sealing import HeardQuestion, SealedQuestion, Sealing, SignatureWanted
-from gnd.fleet_bus.serving import Request
+from gnd.fleet_bus.serving import CLOCK_RETRY_S, Request
 from gnd.fleet_bus.short_seals import LATE, ShortSeal, TerseSeal, is_terse
 
 TILES = "gnd/v1/tiles/ndt/13033/03021/12301"
@@ -465,6 +466,30 @@ def test_attack_report_kept_for_long(scene: Scene, monkeypatch: pytest.MonkeyPat
         monkeypatch.undo()
         with pytest.raises(SealError, match="check the vehicle's clock"):
             shard.check_question(CHANGE, b"kept", kept)
+
+
+@pytest.mark.parametrize("what", ["seal", "certificate"])
+def test_a_report_that_does_not_count_by_the_clock_of_a_shard_is_kept_by_its_vehicle(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """Refused for good, it would be given up, though the clock may be that of the shard; once clocks are right, it
+    counts.
+    """
+    begins = NOW + HOUR if what == "certificate" else NOW - HOUR
+    folder = scene.authority.part("vehicle", f"late-{what}", begins=begins, ends=NOW + 10 * HOUR)
+    with scene.join(folder) as vehicle:
+        if what == "seal":
+            monkeypatch.setattr(sealing_module, "MOST_SKEW_S", -1.0)
+        words = (
+            "check the vehicle's clock, and that of shard s1" if what == "seal" else "not valid yet: check the clocks"
+        )
+        with pytest.raises(RequestFailed, match=words) as failed:
+            scene.report(b"early", vehicle)
+        assert not isinstance(failed.value, RequestRefused)
+        assert (failed.value.attempts, failed.value.retry_after_s) == (1 if what == "seal" else 2, CLOCK_RETRY_S)
+        monkeypatch.undo()
+        if what == "seal":
+            assert scene.report(b"early", vehicle) == b"true"
 
 
 @pytest.mark.parametrize("what", ["body", "key", "name"])

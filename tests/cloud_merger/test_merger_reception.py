@@ -8,7 +8,7 @@ from merger_world import POLE, TILE, change_of, report_of
 
 from gnd.cloud_merger import reception
 from gnd.cloud_merger.ownership import Members, owner_of
-from gnd.cloud_merger.reception import Reception
+from gnd.cloud_merger.reception import Orphans, Reception
 from gnd.deploy.fleet_identities import make_identities
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -97,6 +97,60 @@ def test_districts_are_given_up_when_their_owner_comes_and_taken_back_when_it_go
         two.close()
         wait_for("the death is noticed", lambda: shard.died == ["two"])
         assert [len(all_acks(session, report)) for report in others] == [1] * len(others)
+
+
+def test_a_report_that_comes_again_and_again_is_kept_whoever_owns_its_district(cloud, shard, monkeypatch):
+    """Linked routers may hand it to this shard alone, long after another has become the owner."""
+    monkeypatch.setattr(reception, "ORPHAN_S", 0.05)
+    owned = [report for report in REPORTS[:-1] if owner_of(report.district, ["one", "two"]) == "two"]
+    with raw_session(cloud.endpoint) as session:
+        cloud.bus.declare_alive(alive_key("merger", "two"))  # lives, but does not answer
+        wait_for("two is known", lambda: not shard._members.is_mine(owned[0].district))
+        assert len(all_acks(session, owned[0])) == 0
+        wait_for("it has asked again", lambda: len(all_acks(session, owned[0])) == 1)
+        assert len(all_acks(session, owned[0])) == 1, "from then on at once"
+    assert shard.districts == (), "whose it is does not change"
+
+
+def test_orphans_are_what_comes_again_within_a_time():
+    now_s = [100.0]
+    orphans, place, other = Orphans(lambda: now_s[0]), ("ndt", TILE.district), ("ndt", TILES[-1].district)
+    assert not orphans.has(place, "key", b"one")
+    now_s[0] += 1.0
+    assert not orphans.has(place, "key", b"one"), "the owner may be about to answer"
+    now_s[0] += 1.5
+    assert not orphans.has(place, "key", b"two"), "another message"
+    assert orphans.has(place, "key", b"one")
+    assert orphans.has(place, "key", b"two"), "of a district of which one has come again"
+    assert not orphans.has(other, "elsewhere", b"two")
+    now_s[0] += 31.0
+    assert not orphans.has(place, "key", b"three")
+    assert not orphans.has(place, "key", b"two"), "it was heard long ago"
+    now_s[0] += 2.0
+    assert orphans.has(place, "key", b"two")
+
+
+def test_who_does_not_own_a_district_says_nothing_of_a_seal(cloud, shard, tmp_path):
+    """It cannot know the key that a vehicle shares with the owner: told so, the vehicle would forget it each time."""
+    identities = make_identities(tmp_path, 2, 1)
+    district = next(one.district for one in REPORTS if owner_of(one.district, ["one", "two"]) == "two")
+    key = change_key("ndt", district)
+
+    def joined(name):
+        return open_bus(BusConfig(connect=(cloud.endpoint,), identity=identities / name), name=name)
+
+    with joined("merger-0") as one, joined("merger-1") as two, joined("vehicle-00") as vehicle:
+        for bus, name in ((one, "one"), (two, "two")):
+            members = Members(name)
+            members.note("two" if name == "one" else "one", alive=True)
+            reception = Reception(
+                bus, members, lambda _key, payload, _asker: ChangeAck(payload.decode(), "stored"), print
+            )
+            bus.serve("gnd/v1/change/**", reception._fallback, kind="change", concerns=reception._may_answer)
+        ids = [report_of(n, change_of(None, [0], {0: POLE})).report_id for n in range(4)]
+        acks = [vehicle.request(key, one.encode(), kind="change", timeout_s=20.0) for one in ids]
+        assert [ChangeAck.decode(ack).report_id for ack in acks] == [ids[0], "", "", ""]
+        assert one.connection.sealing.refused == {}
 
 
 def test_a_key_that_is_no_district_is_answered_rather_than_ignored(cloud, shard):
