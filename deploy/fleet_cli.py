@@ -14,7 +14,7 @@ import click
 from rich.console import Console
 
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
-from gnd.deploy.fleet_identities import make_identities
+from gnd.deploy.fleet_identities import FLEET, make_identities, sign_map
 from gnd.deploy.next_commands import after_fleet
 from gnd.deploy.ports import claim_port
 from gnd.deploy.report.software import software
@@ -209,9 +209,6 @@ def run(
         from gnd.deploy.fleet import run_fleet
         from gnd.deploy.live import progress_bars
         from gnd.deploy.processes import start_fork_server
-        from gnd.tile_store.catalogs import sign_unsigned_catalogs
-        from gnd.tile_store.district_lists import sign_list
-        from gnd.tile_store.signatures import sign_unsigned
         from gnd.tile_store.signing import Signing
         from gnd.tile_store.sqlite_store import SqliteStore
 
@@ -237,11 +234,8 @@ def run(
     if secure:
         identities = make_identities(folder.root, config.shards, len(prepared.agent_drives))
         prepared = dataclasses.replace(prepared, identities=identities)
-        with SqliteStore(folder.store, signing=Signing(identities / "fleet")) as store:
-            sign_unsigned(store)  # the base map: without that no vehicle would take it
-            sign_unsigned_catalogs(store)
-            for layer in store.layers():
-                sign_list(store, layer)
+        with SqliteStore(folder.store, signing=Signing(identities / FLEET)) as store:
+            sign_map(store)
     prepare_s = time.monotonic() - started_s
     with orderly(), place() as site:
         outcome = run_fleet(config, folder, prepared, console, threading.Event(), site, page=page)

@@ -16,11 +16,13 @@ from typing import Any, Final
 
 from gnd.deploy.chaos.clients import Receipt, held_by, read_receipts
 from gnd.deploy.chaos.street import LAYER
+from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.tile_store.check import check_store
 from gnd.tile_store.connection import SqlConnection, fetch
 from gnd.tile_store.location import StoreLocation
+from gnd.tile_store.signatures import GOOD, signatures
 from gnd.tile_store.sqlite_store import SqliteStore, SqlStore
 from gnd.vehicle_agent.link.outbox import Outbox
 
@@ -59,7 +61,8 @@ class Findings:
         torn_tiles: receipts that did not decode, or are not what the store has under that number.
         stuck_tiles: tiles with work that has not come to an end.
         unreleased: reports of which clients still wait for word.
-        damages: what `gnd map check` finds.
+        signed: versions that a publisher of the fleet answers for, where all are to be signed.
+        damages: what `gnd map check` finds, and versions that nobody answers for where all are to be signed.
         identical_map: whether `gnd map verify` computes the newest version of every tile alike.
     """
 
@@ -67,6 +70,7 @@ class Findings:
     acknowledged: int = 0
     versions: int = 0
     received: int = 0
+    signed: int = 0
     lost: list[str] = field(default_factory=list)
     doubled: list[str] = field(default_factory=list)
     torn_tiles: list[str] = field(default_factory=list)
@@ -95,6 +99,7 @@ class Findings:
             "identical_map": self.identical_map,
             "reports": self.reports,
             "versions": self.versions,
+            "signed": self.signed,
             "received_tiles": self.received,
             "unreleased": len(self.unreleased),
             "damages": len(self.damages),
@@ -214,6 +219,14 @@ def find_stuck(found: Findings, store: SqlStore) -> None:
     waiting = {name: n for name, n in store.upload_counts().by_state.items() if name in _UNREAD}
     found.stuck_tiles += [f"{n} uploads are {name}" for name, n in waiting.items()]
     found.stuck_tiles += [f"{one.tile.path}: version {one.version} is not announced" for one in store.notices()]
+
+
+def find_unsigned(found: Findings, store: SqlStore, identity: Path) -> None:
+    """Has a publisher of the fleet signed every version? What a vehicle knows is enough to tell."""
+    answered = list(signatures(store, Publishers(identity), LAYER, all_versions=True))
+    wrong = [one for one in answered if one.status != GOOD]
+    found.signed = len(answered) - len(wrong)
+    found.damages += [f"{one.tile.path} version {one.version}: {one.status}: {one.why}" for one in wrong]
 
 
 def _unmerged(c: SqlConnection) -> list[tuple[int, str]]:

@@ -105,7 +105,7 @@ class _Trips:
 
     @property
     def _pseudonym(self) -> str:
-        return f"{self._task.name}-{self._trip:03}"
+        return _pseudonym(self._task.name, self._trip)
 
     def _begin(self, pseudonym: str) -> Outbox:
         outbox = _TimedOutbox(self._task.folder / f"{pseudonym}.sqlite", self._task.times)
@@ -139,6 +139,15 @@ class _Trips:
         for outbox, sender in self._open.values():
             sender.close()
             outbox.close()
+
+
+def _pseudonym(vehicle: str, trip: int) -> str:
+    return f"{vehicle}-{trip:03}"
+
+
+def first_pseudonym(vehicle: str) -> str:
+    """What a vehicle is called on its first trip."""
+    return _pseudonym(vehicle, 0)
 
 
 def put(outbox: Outbox, sent: SentReport) -> bool:

@@ -1,6 +1,7 @@
 """`gnd lab --regions R --hosts H` in earnest: PostgreSQL with a standby, routers, shards, vehicles, faults."""
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from lab_testing import gnd_lab, has_namespaces, needs_root, own_name, started, 
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.hosts.data import labs_with_data
 from gnd.deploy.lab.hosts.postgres import server_programs
+from gnd.fleet_bus.identity.folder import load_identity
 
 pytest.importorskip("psycopg", reason="pip install 'gnd-fleet[postgres]'")
 LONGEST_S = 900.0  # the test's own bound on a busy machine; alone it takes a minute
@@ -33,22 +35,35 @@ pytestmark = [
 ]
 
 
-def test_a_lost_database_host_and_a_cut_region_lose_nothing(tmp_path: Path) -> None:
+def test_a_lost_database_host_a_cut_region_and_wrong_clocks_lose_nothing(tmp_path: Path) -> None:
+    """With certificates: what is the same without is tested by it, too."""
     name, out = own_name(), tmp_path / "out"
-    faults = ("--faults", "database-host,partition", "--away", "3", "--cut", "5")
-    with started("hosts", *SMALL, *faults, "--name", name, "--out", str(out), "--json") as process:
+    faults = ["database-host", "partition", *(["boot-vehicles"] if shutil.which("cc") else [])]
+    options = ("--secure", "--faults", ",".join(faults), "--away", "3", "--cut", "5", "--clock", "-900")
+    with started("hosts", *SMALL, *options, "--name", name, "--out", str(out), "--json") as process:
         text, err = process.communicate(timeout=LONGEST_S)
     assert process.returncode == 0, err + text
     told = json.loads(text)
     assert told == json.loads((out / "lab_hosts.json").read_text())
     assert (told["lost"], told["doubled"], told["stuck_tiles"], told["failures"]) == (0, 0, 0, [])
     assert told["identical_map"]
-    assert [one["fault"] for one in told["faults"]] == ["database-host", "partition"]
+    assert told["signed"] >= told["versions"] > 0
+    assert (told["damages"], told["unreleased"]) == (0, 0)
+    assert [one["fault"] for one in told["faults"]] == faults
     assert min(one["acknowledged"] for one in told["faults"]) > 0
     logs = {path.stem: path.read_text() for path in (out / "logs").iterdir()}
     assert "database-b takes over" in logs["database-b"]
     assert "started streaming WAL" in logs["database-a"], "the lost host came back as the standby"
     assert json.loads((out / "witness.json").read_text()) == {"primary": "database-b", "is_alone": False}
+    assert "router listens at tls/198.19." in logs["router-0"]
+    assert "linked with the router at tls/198.19." in logs["hub"]
+    identities = {path.name: load_identity(path).member.common_name for path in (out / "identities").iterdir()}
+    assert {"router-1": "router.router-1", "shard-0": "shard.shard-0", "tiles-0": "tiles.tiles-0"}.items() <= (
+        identities.items()
+    )
+    assert identities["vehicle-1-0"] == "vehicle.vehicle-1-0-000"
+    if "boot-vehicles" in faults:
+        assert "check the vehicle's clock, and that of shard shard-" in logs["vehicle-1-0"]
     assert not has_namespaces(name)
     assert name not in labs_with_data()
 

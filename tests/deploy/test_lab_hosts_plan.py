@@ -24,8 +24,9 @@ from gnd.deploy.errors import LabError
 from gnd.deploy.lab.groups import DEFAULT_GROUPS
 from gnd.deploy.lab.hosts import data
 from gnd.deploy.lab.hosts.cloud import read_times
-from gnd.deploy.lab.hosts.faults import FAULTS, chosen_faults, parse_faults
-from gnd.deploy.lab.hosts.plan import DATABASES, OF_REGION, HostsSize, plan_hosts
+from gnd.deploy.lab.hosts.faults import BY_FAULT, FAULTS, chosen_faults, parse_faults
+from gnd.deploy.lab.hosts.identities import members_of
+from gnd.deploy.lab.hosts.plan import DATABASES, OF_REGION, WITNESS, HostsSize, client_names, plan_hosts
 from gnd.deploy.lab.hosts.run import HostsOptions
 from gnd.deploy.lab.hosts.slow_disk import disk_of, groups_of_disks
 from gnd.deploy.lab.hosts.tables import print_hosts
@@ -160,7 +161,7 @@ def test_either_version_of_control_groups_can_slow_a_disk(tmp_path: Path) -> Non
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 def test_a_clock_is_wrong_in_the_processes_of_its_host_alone_and_nothing_else_is(tmp_path: Path) -> None:
     """Real processes: one that is told of its clock after it was forked, and one that it starts."""
-    one, other = plan_hosts("t", HostsSize(2, 2)).hosts
+    one, other = (host.name for host in plan_hosts("t", HostsSize(2, 2)).hosts)
     clocks = HostClocks(tmp_path / "clocks")
     environments = [dict(clocks.environment(host)) for host in (one, other)]
     ask = "import time; time.sleep(0.01); print(time.time(), time.monotonic())"
@@ -288,6 +289,28 @@ def test_without_bodies_acknowledgements_count_and_how_soon_tiles_and_versions_c
     assert gone.back_s == pytest.approx(0.9), "the last of all regions"
     good = Findings(reports=3, acknowledged=3, versions=1, received=9, identical_map=True)
     assert outcome((gone,), good).failures == []
+
+
+def test_while_a_clock_is_so_wrong_that_seals_do_not_count_reports_may_wait() -> None:
+    late = trial([[9.0, 14.8], [9.0, 14.8]])
+    assert late.counted_gap_s > 4.0
+    waited = replace(late, is_untimely=True, tiles_s=[[9.5, 10.5, 11.5, 12.5, 13.5, 14.5]] * 2)
+    assert waited.counted_gap_s <= 1.0, "tiles may not"
+    assert waited.back_s == pytest.approx(14.8 - waited.ended_s)
+    fault = BY_FAULT["boot-shard-host"]
+    assert [fault.is_untimely(s) for s in (900.0, -600.0, 599.0)] == [True, True, False]
+    assert not BY_FAULT["clock-shard-host"].is_untimely(900.0), "keys that were agreed on hold"
+
+
+def test_with_certificates_all_endpoints_are_private_and_everybody_has_a_name() -> None:
+    plan = plan_hosts("t", HostsSize(2, 4, 1, is_secure=True))
+    assert all(one.startswith("tls/198.19.") for region in (0, 1) for one in plan.routers(region))
+    members = members_of(plan)
+    assert len(set(members.values())) == len(members)
+    parts = {part for host in plan.hosts for part in host.parts} - {*DATABASES, WITNESS}
+    clients = {name for region in (0, 1) for name in client_names(plan, region)}
+    assert set(members) == parts | clients | {"messenger", "fleet"}
+    assert {members[one].role for one in clients} == {"vehicle"}
 
 
 def outcome(trials: tuple[HostTrial, ...], findings: Findings, settled_s: float | None = 1.0) -> HostsOutcome:

@@ -16,9 +16,9 @@ from gnd.deploy.chaos.inflict import MESSENGER, Inflictor
 from gnd.deploy.chaos.run import Timeline
 from gnd.deploy.chaos.street import ChaosStreet
 from gnd.deploy.errors import LabError
-from gnd.deploy.lab.hosts.cloud import client_names, links_of_region
+from gnd.deploy.lab.hosts.cloud import identity_of, links_of_region
 from gnd.deploy.lab.hosts.network import LabEnd, lose_between
-from gnd.deploy.lab.hosts.plan import HUB
+from gnd.deploy.lab.hosts.plan import HUB, client_names
 from gnd.deploy.lab.hosts.running import HostsCloud
 from gnd.deploy.processes import Supervisor
 from gnd.fleet_bus.bus import open_bus
@@ -161,7 +161,8 @@ class LabChaos:
 def lab_chaos(cloud: HostsCloud, street: ChaosStreet, seed: int, store: SqlStore) -> Iterator[LabChaos]:
     """What inflicts chaos while the block runs; the calling thread must be in the middle's namespace."""
     victim = LabVictim(cloud, store, _HeldLines(cloud))
-    config = BusConfig(connect=(cloud.plan.hub, *cloud.plan.routers(0)[:1]), patient=True)
+    own = identity_of(cloud.plan, cloud.folders, MESSENGER)
+    config = BusConfig(connect=(cloud.plan.hub, *cloud.plan.routers(0)[:1]), patient=True, identity=own)
     with ExitStack() as stack:
         bus = stack.enter_context(open_bus(config, name=MESSENGER))
         inflictor = Inflictor(victim, street, seed, bus)

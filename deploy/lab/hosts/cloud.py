@@ -4,8 +4,8 @@ import json
 import random
 import threading
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -17,13 +17,14 @@ from gnd.deploy.chaos.street import LAYER, read_street
 from gnd.deploy.lab.groups import Group, LabLink, unpaced
 from gnd.deploy.lab.hosts.bucket import bucket_server
 from gnd.deploy.lab.hosts.database import DatabaseSide, database
-from gnd.deploy.lab.hosts.plan import BUCKET, DATABASES, HUB, WITNESS, WITNESS_PORT, HostsPlan
+from gnd.deploy.lab.hosts.plan import BUCKET, DATABASES, HUB, WITNESS, WITNESS_PORT, HostsPlan, client_names
 from gnd.deploy.lab.hosts.witness import witness
 from gnd.deploy.lab.lab import Lab
 from gnd.deploy.processes import ProcessSpec
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusClosed, BusError
+from gnd.fleet_bus.identity.following import follow_revoked
 from gnd.fleet_bus.links import LinkProfile
 from gnd.fleet_bus.router import run_router, wait_for_stop
 from gnd.schemas.keys import tile_key, update_keys
@@ -36,9 +37,13 @@ LEASE_S: Final = 2.0
 SHARD_POLL_S: Final = 0.02
 REPORTS_OF_TRIP: Final = 60
 """Each outbox is looked at five times a second as long as one of its reports is not released."""
+ONE_TRIP: Final = 1_000_000
+"""With certificates a vehicle has one identity, and so makes one trip."""
 ASK_EVERY_S: Final = 0.1
 ASK_S: Final = 20.0
 HEARD_SUFFIX: Final = ".heard"
+ShardOf = Callable[[str, str, tuple[str, ...]], ShardConfig]
+"""The configuration of a shard of that name, with the store at a URL, and these routers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +74,11 @@ class LabFolders:
         return self.root / "logs"
 
     @property
+    def identities(self) -> Path:
+        """Of each process, where there are certificates."""
+        return self.root / "identities"
+
+    @property
     def relays(self) -> Path:
         """Accounts of the links."""
         return self.root / "relays"
@@ -83,11 +93,6 @@ def link_groups(plan: HostsPlan, profile: LinkProfile) -> tuple[Group, ...]:
     """A namespace for each vehicle of each region, and for one client a region that asks for tiles."""
     names = [name for region in range(plan.size.regions) for name in client_names(plan, region)]
     return tuple(Group(name, profile, number, 1) for number, name in enumerate(names))
-
-
-def client_names(plan: HostsPlan, region: int) -> tuple[str, ...]:
-    """The clients of a region: its vehicles, then who asks for tiles."""
-    return (*(f"vehicle-{region}-{n}" for n in range(plan.size.vehicles)), f"asker-{region}")
 
 
 def links_of_region(plan: HostsPlan, lab: Lab, region: int) -> tuple[LabLink, ...]:
@@ -122,13 +127,13 @@ def bucket_processes(plan: HostsPlan, folders: LabFolders) -> list[ProcessSpec]:
     return [ProcessSpec(BUCKET, bucket_server, (host.address, folders.data / BUCKET), namespace=host.namespace)]
 
 
-def cloud_processes(plan: HostsPlan) -> list[ProcessSpec]:
+def cloud_processes(plan: HostsPlan, shard_of: ShardOf) -> list[ProcessSpec]:
     """The hub, and each region's router, tile server and shard."""
     specs = [ProcessSpec(HUB, lab_router, (plan.hub, ()), namespace=plan.host_of(HUB).namespace)]
     for region in range(plan.size.regions):
         routers = plan.routers(region)
         at = {part: plan.host_of(f"{part}-{region}") for part in ("router", "tiles", "shard")}
-        shard = shard_config(f"shard-{region}", plan.database_url, routers)
+        shard = shard_of(f"shard-{region}", plan.database_url, routers)
         specs += [
             ProcessSpec(
                 f"router-{region}", lab_router, (plan.router(region), (plan.hub,)), namespace=at["router"].namespace
@@ -152,6 +157,16 @@ def shard_config(name: str, url: str, routers: tuple[str, ...]) -> ShardConfig:
     )
 
 
+def with_identities(plan: HostsPlan, folders: LabFolders, specs: Iterable[ProcessSpec]) -> list[ProcessSpec]:
+    """The same processes, each with its identity where there are certificates; see `identities.members_of`."""
+    return [replace(spec, identity=identity_of(plan, folders, spec.name)) for spec in specs]
+
+
+def identity_of(plan: HostsPlan, folders: LabFolders, process: str) -> Path | None:
+    """Its identity folder; None: there are no certificates."""
+    return folders.identities / process if plan.size.is_secure else None
+
+
 def client_processes(plan: HostsPlan, lab: Lab, folders: LabFolders, seed: int, every_s: float) -> list[ProcessSpec]:
     """Vehicles and askers of all regions."""
     specs = []
@@ -166,7 +181,14 @@ def client_processes(plan: HostsPlan, lab: Lab, folders: LabFolders, seed: int, 
                 )
             else:
                 task = clients.ChaosVehicleTask(
-                    routers, name, folders.vehicles, seed, every_s, session, times, REPORTS_OF_TRIP
+                    routers,
+                    name,
+                    folders.vehicles,
+                    seed,
+                    every_s,
+                    session,
+                    times,
+                    ONE_TRIP if plan.size.is_secure else REPORTS_OF_TRIP,
                 )
                 spec = ProcessSpec(name, clients.vehicle, (task,), namespace=link.vehicle_namespace)
             specs.append(spec)
@@ -182,6 +204,7 @@ def lab_tiles(location: StoreLocation, connect: tuple[str, ...], *, stop: thread
     """Serve tiles, as `roles.store`, at several routers, and given up soon where its host falls silent."""
     config = BusConfig(connect=connect, patient=True, lease_ms=BUS_LEASE_MS)
     with open_store(location, create=False) as opened, open_bus(config, name="tiles") as bus, TileServer(opened, bus):
+        follow_revoked(bus)
         wait_for_stop(stop)
 
 

@@ -12,11 +12,8 @@ from rich.console import Console
 
 from gnd.deploy.errors import LabError
 from gnd.deploy.interruption import ending_in_order
-from gnd.deploy.lab.hosts.data import data_folder
-from gnd.deploy.lab.hosts.network import build_network
 from gnd.deploy.lab.hosts.plan import BUCKET, HostsPlan, HostsSize, plan_hosts
 from gnd.deploy.lab.hosts.tables import hosts_verdict, print_hosts
-from gnd.deploy.lab.lab import open_lab
 from gnd.deploy.lab.tools import check_rights
 from gnd.extras import need_all
 from gnd.fleet_bus.links import LinkProfile, load_link
@@ -38,6 +35,9 @@ SIZE: Final = HostsSize()
 @click.option("--hosts", "count", type=int, default=SIZE.hosts, show_default=True, help="Machines, 2 or more.")
 @click.option("--vehicles", type=int, default=SIZE.vehicles, show_default=True, help="Of each region.")
 @click.option("--bucket", is_flag=True, help="Bodies of tiles lie in a bucket of S3 on one of the hosts.")
+@click.option(
+    "--secure", is_flag=True, help="Certificates for all, made on the fly; TLS and rights by role on the bus."
+)
 @click.option("--link", default="5g", show_default=True, help="Link of each vehicle: a profile or a TOML file.")
 @click.option("--faults", help="With commas, in order; all: each one.  [default: the loss of hosts, and a partition]")
 @click.option("--times", type=click.IntRange(1, 100), default=1, show_default=True, help="How often the list is done.")
@@ -61,7 +61,7 @@ def hosts(regions: int, count: int, vehicles: int, link: str, faults: str | None
     a region was not served for longer than --gap. Ctrl-C ends the faults; all up to then is checked and printed.
     Needs root, iproute2 and the programs of a PostgreSQL server.
     """
-    size = HostsSize(regions, count, vehicles, options["bucket"])
+    size = HostsSize(regions, count, vehicles, options["bucket"], options["secure"])
     plan, profile = plan_hosts(options["name"], size), load_link(link)
     need_all()
     from gnd.deploy.lab.hosts.faults import chosen_faults
@@ -96,15 +96,15 @@ def _folder(out: Path | None) -> Path:
 
 
 def _run(plan: HostsPlan, profile: LinkProfile, options: "HostsOptions", folder: Path) -> "HostsOutcome":
-    from gnd.deploy.lab.hosts.cloud import LabFolders, link_groups
+    from gnd.deploy.lab.hosts.cloud import link_groups
     from gnd.deploy.lab.hosts.postgres import server_programs, server_user
     from gnd.deploy.lab.hosts.run import run_hosts
+    from gnd.deploy.lab.hosts.running import opened_hosts
     from gnd.deploy.live import progress_bars
     from gnd.deploy.processes import start_fork_server
 
     server_programs()
     server_user()
-    name = plan.hosts[0].lab
     with (
         ending_in_order(is_awaited=False, within_s=WITHIN_S) as stop,
         _surroundings(plan, options, folder),
@@ -112,10 +112,7 @@ def _run(plan: HostsPlan, profile: LinkProfile, options: "HostsOptions", folder:
     ):
         start_fork_server()
         task = progress.add_task("starting", total=len(options.faults))
-        with open_lab(name, link_groups(plan, profile)) as lab, data_folder(name) as data:
-            build_network(plan, lab.links, lab.cloud_namespace)
-            folders = LabFolders(folder, data)
-            folders.make()
+        with opened_hosts(plan, link_groups(plan, profile), folder) as (lab, folders):
             return run_hosts(
                 plan, lab, folders, options, stop,
                 lambda what, n: progress.update(task, description=what, completed=n),

@@ -11,13 +11,15 @@ from typing import Final, Literal
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.hosts.cloud import links_of_region, state_of_witness
 from gnd.deploy.lab.hosts.network import LabEnd, lose_between
-from gnd.deploy.lab.hosts.plan import BUCKET, DATABASES, HostsPlan, LabHost
+from gnd.deploy.lab.hosts.plan import BUCKET, DATABASES, HostsPlan, LabHost, client_names
 from gnd.deploy.lab.hosts.running import HostsCloud
 from gnd.deploy.lab.hosts.slow_disk import disk_of, groups_of_disks, slow_disk
 from gnd.deploy.lab.hosts.wrong_clock import compiler
 from gnd.deploy.lab.namespaces import pids_in
+from gnd.fleet_bus.sealing import MOST_SKEW_S
 
-Way = Literal["process", "host", "silent", "partition", "one-way", "disk", "clock", "drift", "chaos"]
+Way = Literal["process", "host", "silent", "partition", "one-way", "disk", "clock", "boot", "drift", "chaos"]
+VEHICLES: Final = "vehicles"
 GONE_WITHIN_S: Final = 30.0
 _LOOK_S: Final = 0.01
 
@@ -32,9 +34,10 @@ class HostFault:
         name: as the command and the report name it.
         way: a process is killed; all processes of a host; or the host falls silent, as one without power. Or a region
             is cut off from all others, or what it sends is lost and what it is sent arrives. A host's disk is slow,
-            its clock is wrong, or the clocks of a region's hosts are fast. Or faults of `gnd chaos`, drawn from a seed.
+            its clock is wrong, it is lost and comes back at once with a wrong clock, or the clocks of a region's hosts
+            are fast. Or faults of `gnd chaos`, drawn from a seed.
         part: whose process or host it is; "primary", "standby": whoever is it then. Of the last
-            region, where it has one; "" none.
+            region, where it has one; "vehicles": all of that region; "" none.
     """
 
     name: str
@@ -59,7 +62,11 @@ class HostFault:
     @property
     def is_of_clocks(self) -> bool:
         """Whether clocks are wrong while it lasts."""
-        return self.way in ("clock", "drift")
+        return self.way in ("clock", "boot", "drift")
+
+    def is_untimely(self, clock_s: float) -> bool:
+        """Whether no new seal of a part with a clock that is so wrong counts, or none that comes to it."""
+        return self.way == "boot" and abs(clock_s) >= MOST_SKEW_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +105,9 @@ FAULTS: Final = (
     HostFault("clock-tiles-host", "clock", "tiles"),
     HostFault("clock-shard-host", "clock", "shard"),
     HostFault("clock-database-host", "clock", "primary"),
+    HostFault("clock-vehicles", "clock", VEHICLES),
+    HostFault("boot-shard-host", "boot", "shard"),
+    HostFault("boot-vehicles", "boot", VEHICLES),
     HostFault("drift", "drift"),
     HostFault("chaos", "chaos"),
 )
@@ -142,13 +152,17 @@ def why_not_survived(fault: HostFault, plan: HostsPlan) -> str:
     if lacks := _lacks(fault, plan):
         return lacks
     is_database = fault.part in ("primary", "standby")
-    if fault.way in ("disk", "clock", "drift", "chaos"):
+    if fault.way in ("disk", "clock", "drift", "chaos") or fault.part == VEHICLES:
         return ""
     if is_database and not plan.has_witness:
         return "the loss of a database host needs a third host, which decides who goes on"
     if not is_database and fault.part != BUCKET and plan.size.regions < 2:
         return "needs 2 regions, so that the other one goes on"
-    if fault.way in ("host", "silent") and not plan.has_witness and set(DATABASES) & _parts_of_host(fault, plan):
+    if (
+        fault.way in ("host", "silent", "boot")
+        and not plan.has_witness
+        and set(DATABASES) & _parts_of_host(fault, plan)
+    ):
         return "its host has a database, and there is no third host, which decides who goes on"
     return ""
 
@@ -182,6 +196,8 @@ def begin_fault(cloud: HostsCloud, fault: HostFault, how_much: HowMuch) -> tuple
         return _drift(cloud)
     if fault.is_cut:
         return _cut(cloud, both=fault.way == "partition")
+    if fault.part == VEHICLES:
+        return _hurt_vehicles(cloud, how_much.clock_s, boot=fault.way == "boot")
     part = _part(cloud, fault.part)
     host = cloud.plan.host_of(part)
     if fault.way == "process":
@@ -190,7 +206,12 @@ def begin_fault(cloud: HostsCloud, fault: HostFault, how_much: HowMuch) -> tuple
     if fault.way == "disk":
         return _slow(cloud, host, how_much.writes_per_s)
     if fault.way == "clock":
-        end_clock = cloud.host_clocks.step(host, offset_s=how_much.clock_s)
+        end_clock = cloud.host_clocks.step(host.name, offset_s=how_much.clock_s)
+        return f"{how_much.clock_s:+g} s at {host.name}: {', '.join(host.parts)}", end_clock
+    if fault.way == "boot":
+        end_clock = cloud.host_clocks.step(host.name, offset_s=how_much.clock_s)
+        cloud.lose(host.parts, lambda: kill_all(host))
+        cloud.give_back(host.parts)
         return f"{how_much.clock_s:+g} s at {host.name}: {', '.join(host.parts)}", end_clock
     undo = _silence(cloud, host) if fault.way == "silent" else _nothing
     cloud.lose(host.parts, lambda: kill_all(host))  # at once: who outlives its router would go to another one
@@ -224,7 +245,19 @@ def _cut(cloud: HostsCloud, *, both: bool) -> tuple[str, End]:
 def _drift(cloud: HostsCloud) -> tuple[str, End]:
     """The clocks of the last region's hosts."""
     own = cloud.plan.in_region(cloud.plan.size.regions - 1)
-    return f"1 s a minute at {', '.join(host.name for host in own)}", cloud.host_clocks.drift(*own)
+    return f"1 s a minute at {', '.join(host.name for host in own)}", cloud.host_clocks.drift(
+        *(host.name for host in own)
+    )
+
+
+def _hurt_vehicles(cloud: HostsCloud, clock_s: float, *, boot: bool) -> tuple[str, End]:
+    """The clocks of the last region's vehicles, which are started anew if so asked."""
+    *vehicles, _ = client_names(cloud.plan, cloud.plan.size.regions - 1)
+    end = cloud.host_clocks.step(*vehicles, offset_s=clock_s)
+    if boot:
+        cloud.lose(vehicles)
+        cloud.give_back(vehicles)
+    return f"{clock_s:+g} s at {', '.join(vehicles)}", end
 
 
 def _slow(cloud: HostsCloud, host: LabHost, writes_per_s: int) -> tuple[str, End]:

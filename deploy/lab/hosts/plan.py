@@ -32,12 +32,14 @@ class HostsSize:
         hosts: at least 2, and one for each region.
         vehicles: of each region.
         has_bucket: whether the bodies of tiles lie in a bucket on one of the hosts, not in the database.
+        is_secure: whether all have certificates, and the bus has TLS, rights and seals.
     """
 
     regions: int = 2
     hosts: int = 4
     vehicles: int = 2
     has_bucket: bool = False
+    is_secure: bool = False
 
     def __post_init__(self) -> None:
         if not 2 <= self.hosts <= MOST_HOSTS:
@@ -121,11 +123,14 @@ class HostsPlan:
     @property
     def hub(self) -> str:
         """Endpoint of the hub."""
-        return f"tcp/{self.host_of(HUB).address}:{HUB_PORT}"
+        return self._endpoint(HUB, HUB_PORT)
 
     def router(self, region: int) -> str:
         """Endpoint of a region's router."""
-        return f"tcp/{self.host_of(f'router-{region}').address}:{ROUTER_PORT}"
+        return self._endpoint(f"router-{region}", ROUTER_PORT)
+
+    def _endpoint(self, part: str, port: int) -> str:
+        return f"{'tls' if self.size.is_secure else 'tcp'}/{self.host_of(part).address}:{port}"
 
     def routers(self, region: int) -> tuple[str, ...]:
         """Endpoints of a region's clients, in order: its own router, the hub, the routers of other regions."""
@@ -141,6 +146,11 @@ class HostsPlan:
             "keepalives_idle=1", "keepalives_interval=1", "keepalives_count=1",
         )  # fmt: skip
         return f"postgresql://gnd@{hosts}/gnd?{'&'.join(words)}"
+
+
+def client_names(plan: HostsPlan, region: int) -> tuple[str, ...]:
+    """The clients of a region: its vehicles, then who asks for tiles."""
+    return (*(f"vehicle-{region}-{n}" for n in range(plan.size.vehicles)), f"asker-{region}")
 
 
 def plan_hosts(lab: str, size: HostsSize) -> HostsPlan:

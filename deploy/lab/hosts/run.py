@@ -7,21 +7,31 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from gnd.deploy.chaos.checks import Findings, compare_reports, find_stuck, read_outbox, verified
+from gnd.deploy.chaos.checks import Findings, compare_reports, find_stuck, find_unsigned, read_outbox, verified
 from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
 from gnd.deploy.chaos.inflict import retry
 from gnd.deploy.chaos.run import HURRIED_S, RETRY_S
-from gnd.deploy.chaos.street import LAYER, read_street
+from gnd.deploy.chaos.street import LAYER, ChaosStreet, read_street
 from gnd.deploy.errors import LabError
+from gnd.deploy.fleet_identities import FLEET, sign_map
 from gnd.deploy.interruption import EndEvent
 from gnd.deploy.lab.hosts.chaos import LabChaos, lab_chaos
-from gnd.deploy.lab.hosts.cloud import HEARD_SUFFIX, LabFolders, client_names, read_times
+from gnd.deploy.lab.hosts.cloud import (
+    HEARD_SUFFIX,
+    LabFolders,
+    client_processes,
+    identity_of,
+    read_times,
+    with_identities,
+)
 from gnd.deploy.lab.hosts.faults import HostFault, HowMuch, begin_fault, is_back
-from gnd.deploy.lab.hosts.plan import HostsPlan
+from gnd.deploy.lab.hosts.identities import make_lab_identities
+from gnd.deploy.lab.hosts.plan import HostsPlan, client_names
 from gnd.deploy.lab.hosts.running import HostsCloud, running_hosts
 from gnd.deploy.lab.hosts.verdict import LONGEST_GAP_S, HostsOutcome, HostTrial
 from gnd.deploy.lab.lab import Lab
 from gnd.deploy.lab.namespaces import inside
+from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.location import open_store
 from gnd.tile_store.sqlite_store import SqlStore
@@ -106,6 +116,8 @@ def run_hosts(
         LabError: the laboratory did not begin to work.
     """
     on_step("starting", 0)
+    if plan.size.is_secure:
+        make_lab_identities(plan, folders.root)
     street = read_street(districts=max(2, plan.size.regions))
     with (
         inside(lab.cloud_namespace),
@@ -113,11 +125,12 @@ def run_hosts(
             plan,
             lab,
             folders,
-            street,
-            (options.seed, options.every_s),
+            lambda store: _put_street(street, store),
             has_clocks=any(fault.is_of_clocks for fault in options.faults),
         ) as cloud,
     ):
+        vehicles = client_processes(plan, lab, folders, options.seed, options.every_s)
+        cloud.start(with_identities(plan, folders, vehicles))
         with ExitStack() as stack:
             store = stack.enter_context(open_store(plan.database_url, create=False))
             chaos = None
@@ -148,6 +161,13 @@ def run_hosts(
         died=died,
         chaos=tuple(chaos.rows) if chaos else (),
     )
+
+
+def _put_street(street: ChaosStreet, store: SqlStore) -> TileId:
+    store.put_tiles(street.tiles)
+    if store.signing is not None:
+        sign_map(store)
+    return street.tiles[0].tile_id
 
 
 class _Course:
@@ -214,7 +234,8 @@ class _Course:
         self._wait_until_back()
         self._stop.wait(CALM_S)
         trial = self._trial(fault.name, where, span_s, is_cut=fault.is_cut)
-        return replace(trial, is_bodiless=fault.is_bodiless)
+        is_untimely = self._cloud.plan.size.is_secure and fault.is_untimely(self._options.clock_s)
+        return replace(trial, is_bodiless=fault.is_bodiless, is_untimely=is_untimely)
 
     def _wait_until_back(self) -> None:
         deadline_s = time.monotonic() + BACK_S
@@ -289,5 +310,7 @@ def _look(cloud: HostsCloud, store: SqlStore) -> Findings:
     histories = (store.history(LAYER, head.tile) for head in store.heads(LAYER))
     found.versions = sum(info.kind == "merged" for history in histories for info in history)
     find_stuck(found, store)
+    if (own := identity_of(plan, cloud.folders, FLEET)) is not None:
+        find_unsigned(found, store, own)
     found.verify, found.identical_map = verified(plan.database_url)
     return found

@@ -5,37 +5,48 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Final
 
 import psutil
 import psycopg
 
-from gnd.deploy.chaos.street import LAYER, ChaosStreet
+from gnd.deploy.chaos.street import LAYER
 from gnd.deploy.errors import LabError
+from gnd.deploy.fleet_identities import FLEET
+from gnd.deploy.lab.groups import Group
 from gnd.deploy.lab.hosts.bucket import PLACE, make_bucket
 from gnd.deploy.lab.hosts.cloud import (
     LabFolders,
+    ShardOf,
     bucket_processes,
-    client_processes,
     cloud_processes,
     database_processes,
+    identity_of,
+    shard_config,
     state_of_witness,
+    with_identities,
 )
-from gnd.deploy.lab.hosts.plan import DATABASE_PORT, DATABASES, HostsPlan
+from gnd.deploy.lab.hosts.data import data_folder
+from gnd.deploy.lab.hosts.network import build_network
+from gnd.deploy.lab.hosts.plan import DATABASE_PORT, DATABASES, HostsPlan, client_names
 from gnd.deploy.lab.hosts.postgres import DATABASE, OWNER
 from gnd.deploy.lab.hosts.wrong_clock import HostClocks
-from gnd.deploy.lab.lab import Lab
+from gnd.deploy.lab.lab import Lab, open_lab
 from gnd.deploy.lab.run import relay_processes
 from gnd.deploy.processes import ProcessSpec, Supervisor
 from gnd.deploy.repeating import repeated
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import PLAIN_VARIABLE, BusConfig
 from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import tile_key
 from gnd.tile_store.bodies import move_out
 from gnd.tile_store.location import open_store
+from gnd.tile_store.signing import Signing
+from gnd.tile_store.sqlite_store import SqlStore
 
 READY_S: Final = 300.0
 POLL_S: Final = 0.1
@@ -84,7 +95,9 @@ class HostsCloud:
                 self.supervisor.start(self._specs[spec.name])
 
     def _by_its_clock(self, spec: ProcessSpec) -> ProcessSpec:
-        own = [host for host in self.plan.hosts if spec.name in host.parts]
+        """A part by the clock of its host, a client by one of its own."""
+        own = [host.name for host in self.plan.hosts if spec.name in host.parts]
+        own += [spec.name for region in range(self.plan.size.regions) if spec.name in client_names(self.plan, region)]
         return replace(spec, environment=self.clocks.environment(own[0])) if self.clocks and own else spec
 
     def lose(self, parts: Iterable[str], first: Callable[[], None] = lambda: None) -> None:
@@ -133,25 +146,45 @@ def _children(pid: int) -> list[psutil.Process]:
 
 
 @contextmanager
+def opened_hosts(plan: HostsPlan, groups: tuple[Group, ...], folder: Path) -> Iterator[tuple[Lab, LabFolders]]:
+    """Make namespaces, links, the network between hosts, and folders; all but `folder` is removed with the block.
+
+    Args:
+        plan: which part is on which host.
+        groups: of clients.
+        folder: of the run.
+
+    Raises:
+        LabError: the name is taken, or the kernel refuses.
+    """
+    name = plan.hosts[0].lab
+    with open_lab(name, groups) as lab, data_folder(name) as data:
+        build_network(plan, lab.links, lab.cloud_namespace)
+        folders = LabFolders(folder, data)
+        folders.make()
+        yield lab, folders
+
+
+@contextmanager
 def running_hosts(
     plan: HostsPlan,
     lab: Lab,
     folders: LabFolders,
-    street: ChaosStreet,
-    clients: tuple[int, float],
+    put_map: Callable[[SqlStore], TileId],
+    shard: ShardOf = shard_config,
     *,
     has_clocks: bool = False,
 ) -> Iterator[HostsCloud]:
-    """Start database, routers, tile servers, shards and clients, end all with the block.
+    """Start database, routers, tile servers and shards, and end all with the block, clients too that are started in it.
 
-    The calling thread must be in the middle's namespace.
+    The calling thread must be in the middle's namespace; with certificates these must have been made.
 
     Args:
         plan: which part is on which host.
         lab: its namespaces and links are there.
         folders: made.
-        street: the map that is published first.
-        clients: seed of the reports, and how often a vehicle has one, s.
+        put_map: writes the map that is there first, and gives one of its tiles.
+        shard: the configuration of a shard.
         has_clocks: whether the hosts' clocks may be set wrong, within `clocks_may_be_wrong`.
 
     Raises:
@@ -159,7 +192,7 @@ def running_hosts(
         BusError: no tile server answers.
     """
     with ExitStack() as stack:
-        stack.enter_context(_plain())
+        stack.enter_context(nullcontext() if plan.size.is_secure else _plain())
         supervisor = Supervisor(folders.logs, folders.root / "pids.json")
         stack.callback(supervisor.stop)
         clocks = HostClocks(folders.data / "clocks") if has_clocks else None
@@ -167,16 +200,16 @@ def running_hosts(
         cloud.start(relay_processes(lab, folders.relays))
         cloud.start([*database_processes(plan, folders), *bucket_processes(plan, folders)])
         _make_database(plan)
-        with open_store(plan.database_url) as store:
-            store.put_tiles(street.tiles)
+        own = identity_of(plan, folders, FLEET)
+        with open_store(plan.database_url, signing=None if own is None else Signing(own)) as store:
+            tile = put_map(store)
             if plan.size.has_bucket:
                 make_bucket()
                 move_out(store, PLACE)
         _until(lambda: _has_standby(cloud), "the standby follows")
-        cloud.start(cloud_processes(plan))
-        with open_bus(BusConfig(connect=(plan.hub,), open_timeout_s=READY_S), name="probe") as bus:
-            bus.request(tile_key(LAYER, street.tiles[0].tile_id), b"", kind="tile", timeout_s=READY_S)
-        cloud.start(client_processes(plan, lab, folders, *clients))
+        cloud.start(with_identities(plan, folders, cloud_processes(plan, shard)))
+        with open_bus(BusConfig(connect=(plan.hub,), open_timeout_s=READY_S, identity=own), name="probe") as bus:
+            bus.request(tile_key(LAYER, tile), b"", kind="tile", timeout_s=READY_S)
         stack.enter_context(repeated(lambda _n: cloud.poll(), POLL_S, "supervisor"))
         yield cloud
 

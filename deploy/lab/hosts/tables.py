@@ -33,6 +33,7 @@ def print_hosts(console: Console, outcome: "HostsOutcome") -> None:
         "reports acknowledged": f"{found.acknowledged} of {found.reports}",
         "lost / doubled": f"{len(found.lost)} / {len(found.doubled)}",
         "versions merged / tiles stuck": f"{found.versions} / {len(found.stuck_tiles)}",
+        **({"versions signed": str(found.signed)} if found.signed else {}),
         "map against its journal": "identical" if found.identical_map else f"NOT identical: {found.verify}",
         "settled after": "never" if outcome.settled_s is None else f"{outcome.settled_s:.1f} s",
     }

@@ -27,6 +27,7 @@ class HostTrial:
         versions_s: by region when new versions were heard of.
         is_bodiless: whether bodies could not be read or written while it lasted: only tiles that somebody remembered
             could be had, and nothing was published.
+        is_untimely: whether a clock was so wrong while it lasted that seals did not count: reports wait for it.
     """
 
     fault: str
@@ -40,6 +41,7 @@ class HostTrial:
     tiles_s: Sequence[Sequence[float]] = field(repr=False)
     versions_s: Sequence[Sequence[float]] = field(repr=False)
     is_bodiless: bool = False
+    is_untimely: bool = False
 
     @property
     def ack_gap_s(self) -> float:
@@ -58,19 +60,23 @@ class HostTrial:
 
     @property
     def back_s(self) -> float | None:
-        """How long after its end a cut region had an acknowledgement and a tile again, or every region a tile and a new
-        version; None: nothing was kept from any.
+        """How long after its end a cut region had an acknowledgement and a tile again, every region a tile and a new
+        version (bodies), or an acknowledgement (clocks); None: nothing was kept from any.
         """
-        if not self.is_cut and not self.is_bodiless:
+        if not self.is_cut and not self.is_bodiless and not self.is_untimely:
             return None
         served = [self.acks_s[self.region], self.tiles_s[self.region]]
         if self.is_bodiless:
             served = [*self.tiles_s, *self.versions_s]
+        if self.is_untimely:
+            served = [*self.acks_s]
         return max(next((t for t in times_s if t > self.ended_s), self.until_s) for times_s in served) - self.ended_s
 
     @property
     def counted_gap_s(self) -> float:
         """The time without a service that must not end."""
+        if self.is_untimely:
+            return self.tile_gap_s
         return self.ack_gap_s if self.is_bodiless else max(self.ack_gap_s, self.tile_gap_s)
 
     @property
@@ -205,7 +211,18 @@ class HostsOutcome:
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
         told = self.findings.as_dict()
-        head = ("acknowledged", "lost", "doubled", "stuck_tiles", "identical_map", "unreleased", "versions", "verify")
+        head = (
+            "acknowledged",
+            "lost",
+            "doubled",
+            "stuck_tiles",
+            "identical_map",
+            "unreleased",
+            "versions",
+            "signed",
+            "damages",
+            "verify",
+        )
         return {
             **self.size,
             "seed": self.seed,

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Final
 
 from gnd.deploy.errors import LabError
-from gnd.deploy.lab.hosts.plan import LabHost
 from gnd.deploy.repeating import repeated
 
 VARIABLE: Final = "GND_LAB_CLOCK"
@@ -128,34 +127,34 @@ def clocks_may_be_wrong(folder: Path) -> Iterator[None]:
 
 
 class HostClocks:
-    """The clocks of all hosts.
+    """The clocks of all hosts, and of vehicles, by name.
 
     Args:
-        folder: of a file for each host, which the database's user can read.
+        folder: of a file for each of them, which the database's user can read.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         folder.mkdir(mode=0o755, exist_ok=True)
 
-    def environment(self, host: LabHost) -> tuple[tuple[str, str], ...]:
+    def environment(self, host: str) -> tuple[tuple[str, str], ...]:
         """What processes of a host have in their environment."""
         self.put(host, 0.0)
         return ((VARIABLE, str(self._file(host))),)
 
-    def put(self, host: LabHost, offset_s: float) -> None:
+    def put(self, host: str, offset_s: float) -> None:
         """Set a host's clock wrong by so much."""
         file = self._file(host)
         with file.open("r+b" if file.exists() else "w+b") as opened:
             opened.write(struct.pack("=q", round(offset_s * _NS_PER_S)))
 
-    def step(self, *hosts: LabHost, offset_s: float) -> Callable[[], None]:
+    def step(self, *hosts: str, offset_s: float) -> Callable[[], None]:
         """Set clocks wrong; what sets them right."""
         for host in hosts:
             self.put(host, offset_s)
         return lambda: self._right(hosts)
 
-    def drift(self, *hosts: LabHost) -> Callable[[], None]:
+    def drift(self, *hosts: str) -> Callable[[], None]:
         """Let clocks be fast from now on, a second a minute; what sets them right."""
         began_s, stack = time.monotonic(), ExitStack()
 
@@ -171,9 +170,9 @@ class HostClocks:
 
         return end
 
-    def _right(self, hosts: tuple[LabHost, ...]) -> None:
+    def _right(self, hosts: tuple[str, ...]) -> None:
         for host in hosts:
             self.put(host, 0.0)
 
-    def _file(self, host: LabHost) -> Path:
-        return self._folder / f"{host.name}.clock"
+    def _file(self, host: str) -> Path:
+        return self._folder / f"{host}.clock"
