@@ -397,9 +397,12 @@ class HeldKeys:
             return [one for one in self._of_part.values() if one.is_terse and terse_id(one.key_id) == number]
 
     def forget(self, key: str, agreed: AgreedKey) -> None:
-        """The other side does not have it, or is somebody else."""
+        """The other side does not have it, or is somebody else. One that was only tried on `key` may be somebody's all
+        the same, who seals notices with it.
+        """
         with self._lock:
-            self._part_of.pop(key, None)
+            if self._part_of.pop(key, None) is None:
+                return
             if agreed.other is not None and self._of_part.get(agreed.other.certificate_id) is agreed:
                 del self._of_part[agreed.other.certificate_id]
 

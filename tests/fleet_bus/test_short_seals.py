@@ -310,6 +310,11 @@ def test_several_parts_in_a_role() -> None:
     held.add("a", one)
     assert held.to_use("b", "shard") is one  # the only one: most likely it answers there, too
     assert held.to_use("b", "tiles") is None
+    held.forget("b", one)  # it was another that answered there: that of "a" still seals its notices with this key
+    assert held.find(one.key_id) is one
+    assert held.to_use("a", "shard") is one
+    held.answered("b", second)
+    assert held.to_use("b", "shard") is None
     held.add("b", two)
     assert held.to_use("a", "shard") is one
     assert held.to_use("b", "shard") is two
