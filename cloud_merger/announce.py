@@ -13,6 +13,7 @@ from typing import Final
 from gnd.cloud_merger.ownership import Members
 from gnd.cloud_merger.stored import Bases
 from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.seldom import Seldom
 from gnd.fleet_bus.subscribing import RecallingPublisher
 from gnd.gnd_map.content import AnyTile, changed_between, encode_content_delta, has_deltas
 from gnd.gnd_map.errors import CodecError
@@ -20,7 +21,7 @@ from gnd.gnd_map.tile import Tile, diff
 from gnd.schemas.errors import SchemaError, TooLarge
 from gnd.schemas.keys import update_key
 from gnd.schemas.updates import TileUpdate
-from gnd.tile_store.errors import StoreDamaged
+from gnd.tile_store.errors import ClocksApart, StoreDamaged
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import Notice, StoredTile
 
@@ -37,6 +38,7 @@ OTHERS_AFTER_S: Final = 0.3
 # Who is busy itself finds the owner busy, too: it is given more time, for it has in memory what a notice is made of.
 BUSY_OTHERS_AFTER_S: Final = 2.0
 _LOG = logging.getLogger(__name__)
+_SELDOM: Final = Seldom(_LOG)
 Read = Callable[[StoredTile], AnyTile]
 
 
@@ -64,11 +66,10 @@ class Announcer:
         self._last_s = now_s
         late_s = BUSY_OTHERS_AFTER_S if is_busy else OTHERS_AFTER_S
         waiting = self._own_and_late(self._store.notices(n=at_most), late_s)
-        for notice in waiting:
-            self._announce(notice)
-        if waiting:
-            self._store.announced(waiting)
-        return len(waiting)
+        done = [notice for notice in waiting if self._announce(notice)]
+        if done:
+            self._store.announced(done)
+        return len(done)
 
     def _own_and_late(self, waiting: Sequence[Notice], late_s: float) -> list[Notice]:
         now_s = time.monotonic()
@@ -76,19 +77,24 @@ class Announcer:
         self._seen_s = {one: self._seen_s.get(one, now_s) for one in foreign}
         return [one for one in waiting if now_s - self._seen_s.get(one, -math.inf) >= late_s]
 
-    def _announce(self, notice: Notice) -> None:
+    def _announce(self, notice: Notice) -> bool:
+        """Whether it is done with; False: it is to be announced later."""
         stored = self._store.get(notice.layer, notice.tile, notice.version)
         if stored is None:
             _LOG.info("%s version %d went before it was announced", notice.tile, notice.version)
-            return
+            return True
         try:
             self._store.check_signed(stored)
+        except ClocksApart as error:
+            _SELDOM.warning("not announced now: %s", error)
+            return False
         except StoreDamaged as error:  # the notice's seal would make somebody else's version ours
             _LOG.error("not announced: %s", error)
-            return
+            return True
         parent = self._store.get(notice.layer, notice.tile, stored.parent) if stored.parent else None
         key = update_key(notice.layer, notice.tile)
         self._publisher(key).put(encoded(update_of(stored, parent, self._bases.tile)), tile=notice.tile)
+        return True
 
     def _publisher(self, key: str) -> RecallingPublisher:
         publisher = self._publishers.pop(key, None) or self._bus.advanced_publisher(key)

@@ -37,7 +37,7 @@ from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upl
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
 from gnd.schemas.survey import SurveyReport
-from gnd.tile_store.errors import DistrictElsewhere, IdTaken, ImpossiblePlace, ObjectsAway, StoreDamaged, StoreError
+from gnd.tile_store.errors import BLAMELESS, DistrictElsewhere, IdTaken, ImpossiblePlace, StoreDamaged, StoreError
 from gnd.tile_store.places import ReportPlace
 from gnd.tile_store.store import Store
 from gnd.tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
@@ -105,7 +105,7 @@ class Expander:
         try:
             outcome = self._settled(self._understood(claim))
         # the store's fault, not the upload's: it waits until the page is mended, or the bodies can be read
-        except (StoreDamaged, ObjectsAway) as error:
+        except (StoreDamaged, *BLAMELESS) as error:
             _SELDOM.warning("upload %s waits: %s", claim.upload.report_id, error)
             self._store.postpone_upload(claim, DAMAGED_RETRY_S, blameless=True)
             return ""

@@ -23,7 +23,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
-from gnd.tile_store.errors import DistrictElsewhere, ObjectsAway, StoreDamaged, StoreError, UnknownReports
+from gnd.tile_store.errors import BLAMELESS, DistrictElsewhere, StoreDamaged, StoreError, UnknownReports
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import (
     QUARANTINED,
@@ -99,9 +99,9 @@ class Worker:
             DistrictElsewhere,
         ):  # one of them is to blame; any other is the store's failure
             return [None if one is None else self._published(one) for one in attempted]
-        except ObjectsAway as error:
+        except BLAMELESS as error:
             for one in publications:
-                self._bodies_away(one.claim, error)
+                self._wait_for(one.claim, error)
             return [None] * len(attempted)
         return [None if one is None else next(results) for one in attempted]
 
@@ -114,8 +114,8 @@ class Worker:
         except (StoreDamaged, UnknownReports) as error:
             self._failed(publication.claim, error)
             return None
-        except ObjectsAway as error:
-            self._bodies_away(publication.claim, error)
+        except BLAMELESS as error:
+            self._wait_for(publication.claim, error)
             return None
         return result
 
@@ -144,8 +144,8 @@ class Worker:
             )  # before the tile is read: the store refuses what both together do not fit
             work = self._store.load(claim)
             return self._of_features(work) if is_feature_layer(claim.layer) else self._of_gaussians(work, named)
-        except ObjectsAway as error:
-            self._bodies_away(claim, error)
+        except BLAMELESS as error:
+            self._wait_for(claim, error)
         except StoreError as error:
             if not isinstance(error, StoreDamaged):
                 raise  # the store's failure, not the tile's
@@ -154,7 +154,7 @@ class Worker:
             self._failed(claim, error)
         return None
 
-    def _bodies_away(self, claim: Claim, error: ObjectsAway) -> None:
+    def _wait_for(self, claim: Claim, error: StoreError) -> None:
         """Try again later, for as long as it takes: it is not the tile's fault."""
         _SELDOM.warning("%s is not merged now: %s", claim.tile, error)
         self._store.postpone(claim, RETRY_S, blameless=True)

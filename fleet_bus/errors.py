@@ -13,6 +13,7 @@ BusError
 ├── SealError           a message whose seal is missing, does not fit or is of the wrong part
 │   ├── ClocksDiffer    a seal or a certificate that does not count at this time, by the clock of here
 │   └── NotAnsweredFor  a tile version that no publisher answers for
+│       └── SignedAhead signed at a time that has not come, by the clock of here
 ├── NotMine, Refused, Busy
 │                       raised by handlers: what they say to the asker
 └── LedgerError         a ledger file or run folder that cannot be read
@@ -97,6 +98,10 @@ class NotAnsweredFor(SealError):
     def __init__(self, why: str, text: str) -> None:
         super().__init__(text)
         self.why = why
+
+
+class SignedAhead(NotAnsweredFor):
+    """A version that was signed at a time that has not come, by the clock of here: one of two clocks is wrong."""
 
 
 class NotMine(BusError):

@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gnd.fleet_bus.errors import BusClosed, BusError, IdentityError, NotAnsweredFor, SealError
+from gnd.fleet_bus.errors import BusClosed, BusError, IdentityError, NotAnsweredFor, SealError, SignedAhead
 from gnd.fleet_bus.identity.names import PUBLISHER_ROLES
 from gnd.fleet_bus.seal_keys import certificates_of, holder_of, is_signed_by, may_sign, read_revoked
 from gnd.fleet_bus.sealing import ASK_AGAIN_S, CERTIFICATE_ROOT, MOST_SKEW_S
@@ -238,7 +238,7 @@ class Publishers:
             raise NotAnsweredFor("expired", f"the certificate of {known.holder} did not hold when it was signed")
         ahead_s = signed_s - time.time()
         if ahead_s > MOST_SKEW_S:
-            raise NotAnsweredFor("expired", f"{known.holder} signed it {ahead_s:.0f} s from now: check the clocks")
+            raise SignedAhead("expired", f"{known.holder} signed it {ahead_s:.0f} s from now: check the clocks")
 
     def _certificate(self, signer: bytes) -> _Known:
         """That of an id; one that nobody has shown is asked for, once at a time."""

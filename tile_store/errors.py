@@ -6,6 +6,7 @@ StoreUnavailable     it cannot be opened: no such file, no permission, not a sto
 StoreDamaged       a part of it cannot be read
 StoreAway          the server of its database does not answer, or starts or stops
 ObjectsAway        who keeps objects, such as bodies of versions, does not answer
+ClocksApart        a version was signed at a time that has not come, by the clock of here
 StoreBusy            another process has held the write lock for too long
 StoreMoved         it was copied to another database, which is used instead
 DistrictElsewhere    a district that the store does not own, or that is just moving: nothing was written
@@ -45,6 +46,16 @@ class ObjectsAway(StoreUnavailable):
     """Who keeps objects, such as bodies of versions, does not answer, or cannot do now what is asked: it may pass. No
     report and no tile is to blame.
     """
+
+
+class ClocksApart(StoreUnavailable):
+    """A version was signed at a time that has not come, by the clock of here: it may be that clock which is wrong. No
+    tile is to blame.
+    """
+
+
+BLAMELESS: Final = (ObjectsAway, ClocksApart)
+"""What may pass, and is no tile's and no report's fault."""
 
 
 class StoreMoved(StoreUnavailable):

@@ -9,7 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
-from gnd.fleet_bus.errors import IdentityError, NotAnsweredFor, SealError
+from gnd.fleet_bus.errors import IdentityError, NotAnsweredFor, SealError, SignedAhead
 from gnd.fleet_bus.identity.names import identity_of_environment
 from gnd.fleet_bus.publishers import PublisherKey, Publishers
 from gnd.gnd_map.tile_id import TileId
@@ -18,7 +18,7 @@ from gnd.schemas.catalog_signature import CatalogKind, CatalogSignature, Catalog
 from gnd.schemas.district_list import DistrictsHead, DistrictsSignature
 from gnd.schemas.version_signature import VersionSignature, VersionStatement
 from gnd.tile_store.connection import SqlConnection, change, fetch, post
-from gnd.tile_store.errors import NotPublished, StoreDamaged
+from gnd.tile_store.errors import ClocksApart, NotPublished, StoreDamaged
 from gnd.tile_store.values import NS_PER_S, StoredTile
 
 NOT_SIGNED: Final = {"signer": None, "signed_s": None, "signature": None}
@@ -176,12 +176,17 @@ def check_signed(c: SqlConnection, signing: Signing | None, stored: StoredTile |
     """Whether a version is what one of our publishers has signed; a process without an identity takes what is there.
 
     Raises:
+        ClocksApart: not yet, by the clock of here.
         StoreDamaged: it is not; nothing is to be made of it.
     """
     if signing is None or stored is None:
         return
     try:
         who_signed(c, signing.publishers, stored)
+    except SignedAhead as error:
+        raise ClocksApart(
+            f"tile {stored.tile.path} of layer {stored.layer} version {stored.version}: {error}"
+        ) from error
     except SealError as error:
         raise StoreDamaged(
             f"tile {stored.tile.path} of layer {stored.layer} version {stored.version}: {error};"

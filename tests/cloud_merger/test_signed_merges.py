@@ -12,15 +12,18 @@ import pytest
 from click.testing import CliRunner
 from merger_world import BALL, GROUND, POLE, TILE, VOXEL_BY_VOXEL, WALL, change_of, gaussians_of, report_of
 
-from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger import work
+from gnd.cloud_merger.config import MAX_ATTEMPTS, ShardConfig
 from gnd.cloud_merger.work import Worker
 from gnd.deploy.map_cli import map_group
+from gnd.fleet_bus import publishers
 from gnd.fleet_bus.identity.authority import Authority
 from gnd.fleet_bus.identity.names import IDENTITY_VARIABLE, MemberName
 from gnd.fleet_bus.publishers import Publishers
 from gnd.gnd_map.content import encode_content
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.changes import split
+from gnd.tile_store.errors import ClocksApart
 from gnd.tile_store.signatures import AnsweredVersion, signatures
 from gnd.tile_store.signing import Signing
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -106,6 +109,21 @@ def test_nothing_is_built_on_a_base_that_somebody_has_exchanged(place: Place) ->
         assert [head.version for head in store.heads()] == [1]
         assert store.dirty_count() == 1  # it is tried again, then set aside
     assert [one.status for one in place.answered()] == ["wrong"]
+
+
+def test_a_shard_whose_clock_is_late_waits_for_it(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its clock the base was signed too far in the future: no tile is set aside for that."""
+    monkeypatch.setattr(work, "RETRY_S", 0.0)
+    with place.opened("s") as store:
+        place.hears(store)
+        monkeypatch.setattr(publishers, "MOST_SKEW_S", -3600.0)
+        with pytest.raises(ClocksApart, match=r"operator o signed it -?\d+ s from now: check the clocks"):
+            store.check_signed(store.get("ndt", TILE))
+        for _ in range(2 * MAX_ATTEMPTS):
+            assert place.merge(store) == []
+        assert store.tiles_set_aside() == []
+        monkeypatch.setattr(publishers, "MOST_SKEW_S", 600.0)
+        assert [one.status for one in store.publish(place.merge(store))] == ["published"]
 
 
 def test_what_a_revoked_shard_has_merged_is_signed_again(place: Place) -> None:
