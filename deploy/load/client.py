@@ -7,7 +7,8 @@ import queue
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -42,16 +43,23 @@ class ClientConfig:
         vehicles: whose reports it sends.
         options: of the load.
         runs: the kept drives.
-        connect: endpoint of the router.
+        connect: endpoints of its routers, in order.
         folder: where it tells that it is ready, reads when to begin, and writes its accounts.
+        identities: of its vehicles, each under its name; None: there are no certificates.
     """
 
     number: int
     vehicles: range
     options: LoadOptions
     runs: KeptRuns
-    connect: str
+    connect: tuple[str, ...]
     folder: Path
+    identities: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the process."""
+        return f"client-{self.number}"
 
     @property
     def ready(self) -> Path:
@@ -73,9 +81,19 @@ class ClientConfig:
         """What became of its reports: a JSON object a line."""
         return self.folder / f"client-{self.number}.jsonl"
 
+    @property
+    def all_vehicles(self) -> str:
+        """A name that is each of theirs, as subscriptions say it."""
+        return f"load-{self.number}-$*"
+
     def name_of(self, vehicle: int) -> str:
-        """Name of a vehicle; all of a client begin alike, so that one subscription hears of all."""
-        return f"load-{self.number}-{vehicle}"
+        """Name of a vehicle."""
+        return vehicle_name(self.number, vehicle)
+
+
+def vehicle_name(client: int, vehicle: int) -> str:
+    """Name of a vehicle; all of a client begin alike, so that one subscription hears of all."""
+    return f"load-{client}-{vehicle}"
 
 
 def start_file(folder: Path) -> Path:
@@ -87,9 +105,8 @@ def client(config: ClientConfig, *, stop: threading.Event) -> None:
     """Send all reports of the client's vehicles, then wait until all are released, at most `drain_s`."""
     streets = Streets.of(config.runs, config.options)
     table = streets.timetable()
-    bus_config = BusConfig(connect=(config.connect,))
-    with open_bus(bus_config, name=f"client-{config.number}") as bus:
-        herd = _Herd(config, streets, bus)
+    with _sessions(config) as buses:
+        herd = _Herd(config, streets, buses)
         config.ready.write_text(str(table.count(config.vehicles)), encoding="utf-8")
         start_s = _started(config.folder, stop)
         if start_s is None:
@@ -103,6 +120,20 @@ def client(config: ClientConfig, *, stop: threading.Event) -> None:
             herd.close()
             _write(config.accounts, herd.accounts)
             config.cpu.write_text(repr(time.process_time() - before_s), encoding="utf-8")
+
+
+@contextmanager
+def _sessions(config: ClientConfig) -> Iterator[dict[str, Bus]]:
+    """By name one session for all vehicles; with certificates one each: who seals a report must be who it is of."""
+    folder, names = config.identities, [config.all_vehicles]
+    if folder is not None:
+        names = [config.name_of(vehicle) for vehicle in config.vehicles]
+    with ExitStack() as stack:
+        buses = {}
+        for name in names:
+            own = BusConfig(connect=config.connect, identity=None if folder is None else folder / name)
+            buses[name] = stack.enter_context(open_bus(own, name=name))
+        yield buses
 
 
 def read_accounts(path: Path) -> list[SenderAccount]:
@@ -129,18 +160,20 @@ def _started(folder: Path, stop: threading.Event) -> float | None:
 class _Herd:
     """The vehicles of one client: who is on the way with what, and the threads that send."""
 
-    def __init__(self, config: ClientConfig, streets: Streets, bus: Bus) -> None:
+    def __init__(self, config: ClientConfig, streets: Streets, buses: Mapping[str, Bus]) -> None:
         self.accounts: list[SenderAccount] = []
         self._config, self._streets, self._options = config, streets, config.options
         self._shifts: dict[int, DistrictShift] = {}
         self._open: dict[str, Open] = {}
         self._lock = threading.Lock()
         # Urgent first: a second half before new flags, as a vehicle has it in its outbox longer.
-        self._work: queue.PriorityQueue[tuple[int, int, Work | None]] = queue.PriorityQueue()
+        self._work: queue.PriorityQueue[tuple[int, int, Callable[[], None] | None]] = queue.PriorityQueue()
         self._number = itertools.count()
         self._room = threading.Semaphore(2 * self._options.in_flight)
-        self._sender = Sender(bus, SendingMeasured(streets.bases))
-        bus.subscribe(f"{ROOT}/want/load-{config.number}-$*", self._on_notice, kind="ack")
+        measured = SendingMeasured(streets.bases)
+        self._senders = {name: Sender(bus, measured) for name, bus in buses.items()}
+        for name, bus in buses.items():
+            bus.subscribe(f"{ROOT}/want/{name}", self._on_notice, kind="ack")
         self._threads = [threading.Thread(target=self._run, daemon=True) for _ in range(self._options.in_flight)]
         for thread in self._threads:
             thread.start()
@@ -171,7 +204,7 @@ class _Herd:
     def close(self) -> None:
         """End the threads after their current messages."""
         for _ in self._threads:
-            self._put(9, None)
+            self._work.put((9, next(self._number), None))
         for thread in self._threads:
             thread.join()
 
@@ -189,20 +222,21 @@ class _Herd:
         with self._lock:
             self._open[one.account.report_id] = one
         self.accounts.append(one.account)
-        self._put(1, lambda sender: self._first(sender, one))
+        self._put(1, one, lambda sender: self._first(sender, one))
 
     def _first(self, sender: Sender, one: Open) -> None:
         sender.first(one)
         if self._options.pace == "max":
             self._room.release()
 
-    def _put(self, rank: int, work: Work | None) -> None:
-        self._work.put((rank, next(self._number), work))
+    def _put(self, rank: int, one: Open, work: Work) -> None:
+        sender = self._senders.get(one.account.vehicle) or self._senders[self._config.all_vehicles]
+        self._work.put((rank, next(self._number), lambda: work(sender)))
 
     def _run(self) -> None:
         while (work := self._work.get()[2]) is not None:
             try:
-                work(self._sender)
+                work()
             except GndError:
                 _LOG.exception("a message was not sent")
 
@@ -230,9 +264,9 @@ class _Herd:
                 return
             if state.status == "wanted" and not one.account.halves:
                 one.wanted = state.wanted
-                self._put(0, lambda sender: sender.half(one))
+                self._put(0, one, lambda sender: sender.half(one))
             elif state.status == "resend" and not one.account.whole:
-                self._put(0, lambda sender: sender.whole(one))
+                self._put(0, one, lambda sender: sender.whole(one))
 
     def _ask_after(self) -> None:
         """Ask for the states of acknowledged reports that had no answer for some time, all of a vehicle at once."""
@@ -245,7 +279,7 @@ class _Herd:
                     silent[one.account.vehicle].append(one)
         for vehicle, reports in silent.items():
             for some in _batches(reports):
-                self._put(0, lambda sender, vehicle=vehicle, some=some: self._ask(sender, vehicle, some))  # type: ignore[misc]
+                self._put(0, some[0], lambda sender, vehicle=vehicle, some=some: self._ask(sender, vehicle, some))  # type: ignore[misc]
 
     def _ask(self, sender: Sender, vehicle: str, reports: list[Open]) -> None:
         for state in sender.ask(vehicle, reports):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -13,7 +14,10 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd.deploy.errors import LoadError
 from gnd.deploy.interruption import ending_in_order
+from gnd.deploy.lab.hosts.plan import HostsPlan, HostsSize, plan_hosts
+from gnd.deploy.lab.tools import check_rights
 from gnd.deploy.live import progress_bars
 from gnd.deploy.load.making import kept_runs
 from gnd.deploy.load.plan import LoadOptions
@@ -24,6 +28,9 @@ from gnd.extras import need_all
 from gnd.tile_store.location import LOCATION, StoreLocation
 
 PATH: Final = click.Path(path_type=Path)
+MOST_SECURE: Final = 500
+WITHIN_S: Final = 120.0
+"""An interrupted run on several hosts has more to end."""
 
 
 @click.command(short_help="Replay recorded reports as those of many vehicles and see whether the cloud keeps up.")
@@ -62,6 +69,13 @@ PATH: Final = click.Path(path_type=Path)
     type=LOCATION,
     help="An empty PostgreSQL database, which keeps what is written.  [default: a file, removed afterwards]",
 )
+@click.option(
+    "--secure", is_flag=True, help="Certificates for all, made on the fly; TLS and rights by role on the bus."
+)
+@click.option(
+    "--hosts", "host_count", type=int, help="On so many hosts in network namespaces, as `gnd lab hosts`; needs root."
+)
+@click.option("--regions", type=int, help="With --hosts, each: router, tile server, shard.  [default: 2]")
 @click.option("--keep", type=PATH, help="Empty folder in which store, logs and accounts are kept.")
 @click.option(
     "--json", "json_file", type=click.Path(path_type=Path, allow_dash=True), help="Write the figures; `-`: print them."
@@ -72,21 +86,38 @@ def load(
     store: StoreLocation | None,
     keep: Path | None,
     json_file: Path | None,
+    secure: bool,
+    host_count: int | None,
+    regions: int | None,
     **given: Any,
 ) -> None:
     """Replay the reports of a few drives as those of many vehicles on many streets, and measure the cloud.
 
     Router, tile server and merger shards run as processes of their own. Each street is a copy of the kept one at
     another place, with its map and the reports that were made on it.
+
+    With --hosts they run on several hosts and in several regions, with PostgreSQL and a standby, as `gnd lab hosts` has
+    them, and each client sends through the router of a region. With --secure each vehicle has a connection and a
+    certificate of its own.
     """
     need_all()
     options = LoadOptions(**given)
+    if secure and options.vehicles > MOST_SECURE:
+        raise LoadError(f"--secure: {options.vehicles} vehicles, each with a connection; {MOST_SECURE} is the most")
+    plan = _plan_of(host_count, regions, secure=secure)
     if json_file is not None and str(json_file) != "-" and not json_file.absolute().parent.is_dir():
         raise click.BadParameter(f"there is no folder {json_file.absolute().parent}", param_hint="--json")
     console = Console(stderr=True)
     runs = kept_runs(drives, settled, console)
-    with ending_in_order() as stop, _folder(keep) as folder, _bar(console) as tell:
-        figures = summary(run_load(options, runs, folder, tell, stop, store))
+    ending = ending_in_order() if plan is None else ending_in_order(is_awaited=False, within_s=WITHIN_S)
+    with ending as stop, _folder(keep) as folder, _bar(console) as tell:
+        if plan is None:
+            outcome = run_load(options, runs, folder, tell, stop, store, secure=secure)
+        else:
+            from gnd.deploy.load.hosts import LoadOnHosts
+
+            outcome = LoadOnHosts(plan, options, runs, folder).run(tell, stop)
+        figures = summary(outcome)
     if json_file is not None:
         with click.open_file(str(json_file), "w", encoding="utf-8") as file:
             file.write(json.dumps(figures, indent=2) + "\n")
@@ -94,6 +125,26 @@ def load(
         Console(width=110).print(table_of(figures))
     if figures["why_not"] == ["the run was interrupted"]:
         sys.exit(exit_code())
+
+
+def _plan_of(count: int | None, regions: int | None, *, secure: bool) -> HostsPlan | None:
+    """The laboratory that was asked for, None: none was.
+
+    Raises:
+        LoadError: options do not go together.
+        LabError: there can be no such laboratory, or not here.
+    """
+    if count is None:
+        if regions is not None:
+            raise LoadError("--regions goes with --hosts")
+        return None
+    context = click.get_current_context()
+    for name, why in (("store", "the laboratory has a database"), ("shards", "there is one a region")):
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            raise LoadError(f"--{name} does not go with --hosts: {why}")
+    plan = plan_hosts(f"load-{os.getpid()}", HostsSize(regions or HostsSize().regions, count, 1, is_secure=secure))
+    check_rights()
+    return plan
 
 
 def table_of(figures: dict[str, Any]) -> Table:
@@ -117,7 +168,10 @@ def table_of(figures: dict[str, Any]) -> Table:
         "kept up": yes,
         "limit": figures["limit"],
     }
-    table = Table(show_header=False, title=f"{figures['vehicles']} vehicles")
+    if hosts := figures.get("hosts"):
+        rows["hosts"] = "; ".join(f"{name}: {', '.join(parts)}" for name, parts in hosts.items())
+    secure = ", with certificates" if figures.get("secure") else ""
+    table = Table(show_header=False, title=f"{figures['vehicles']} vehicles{secure}")
     for name, value in rows.items():
         table.add_row(name, value)
     return table

@@ -9,6 +9,13 @@ from gnd.tile_store.location import StoreLocation, conninfo_of, file_of
 
 DATABASE: Final = "database"
 """Name of the part that is a database server's."""
+_NAMES: Final = {
+    "router": ("router", "hub"),
+    "store": ("store", "tiles-"),
+    "shards": ("merger-", "shard-"),
+    DATABASE: (DATABASE,),
+}
+"""How the names of its processes begin, on one machine or on several hosts."""
 _HERE: Final = ("/", "localhost", "127.0.0.1", "::1")
 """How hosts begin that are this machine; a path is a socket."""
 
@@ -33,16 +40,16 @@ def children(pid: int) -> list[int]:
 
 
 def by_part(pids: Mapping[str, int]) -> dict[str, float]:
-    """CPU seconds of the cloud's parts so far: router, store, shards (they receive), their workers (they compute), and
-    the database server, if there is one.
+    """CPU seconds of the cloud's parts so far: routers, tile servers, shards (they receive), their workers (they
+    compute), and database servers, if there are any.
 
     Args:
         pids: of the processes by name, as the supervisor knows them; `DATABASE` beside them.
     """
-    shards = [pid for name, pid in pids.items() if name.startswith("merger-")]
+    of = {part: [pid for name, pid in pids.items() if name.startswith(words)] for part, words in _NAMES.items()}
+    shards = of.pop("shards")
     return {
-        **{part: sum(cpu_s(pid) for name, pid in pids.items() if name == part) for part in ("router", "store")},
-        **{name: cpu_s(pid) for name, pid in pids.items() if name == DATABASE},
+        **{part: sum(map(cpu_s, own)) for part, own in of.items() if own or part != DATABASE},
         "shards": sum(map(_own_s, shards)),  # a worker that has died is counted here
         "workers": sum(cpu_s(child) for pid in shards for child in children(pid)),
     }

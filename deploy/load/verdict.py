@@ -45,6 +45,8 @@ class LoadOutcome:
         notices_s: when the subscriber had heard of each (tile, version), s UTC.
         restarts: how often a process of the cloud was started again.
         interrupted: whether somebody ended the run before its time.
+        unsigned: versions that nobody answers for, where there are certificates; None: there are none.
+        hosts: what ran where, on several hosts.
     """
 
     options: LoadOptions
@@ -62,6 +64,8 @@ class LoadOutcome:
     notices_s: Mapping[tuple[int, int], float] = field(repr=False)
     restarts: int = 0
     interrupted: bool = False
+    unsigned: int | None = None
+    hosts: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
     def sent(self) -> list[SenderAccount]:
@@ -126,6 +130,7 @@ def _not_done(outcome: LoadOutcome) -> Iterable[str]:
         (ledger.aside, "tiles are set aside"),
         (ledger.quarantined, "messages are in quarantine"),
         (outcome.restarts, "processes of the cloud had to be started again"),
+        (outcome.unsigned or 0, "versions are not signed by who may"),
     )
     found = [f"{count} {what}" for count, what in counts if count]
     if outcome.drained_s is None:
@@ -204,6 +209,8 @@ def summary(outcome: LoadOutcome) -> dict[str, Any]:
         "streets": outcome.options.streets,
         "seed": outcome.options.seed,
         "pace": outcome.options.pace,
+        "secure": outcome.unsigned is not None,
+        "hosts": {name: list(parts) for name, parts in outcome.hosts.items()},
     }
 
 

@@ -34,8 +34,12 @@ def own_name() -> str:
 
 
 def gnd_lab(*arguments: str, **options: object) -> subprocess.Popen[str]:
+    return _gnd("lab", *arguments, **options)
+
+
+def _gnd(*arguments: str, **options: object) -> subprocess.Popen[str]:
     return subprocess.Popen(  # type: ignore[call-overload, no-any-return]
-        [sys.executable, "-m", "gnd.deploy.cli", "lab", *arguments],
+        [sys.executable, "-m", "gnd.deploy.cli", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
     )  # fmt: skip
 
@@ -43,7 +47,14 @@ def gnd_lab(*arguments: str, **options: object) -> subprocess.Popen[str]:
 @contextmanager
 def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A `gnd lab` that does not outlive the test, and removes its lab, whatever happens."""
-    process = gnd_lab(*arguments)
+    with started_gnd("lab", *arguments) as process:
+        yield process
+
+
+@contextmanager
+def started_gnd(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """The same of any `gnd` that makes a lab."""
+    process = _gnd(*arguments)
     try:
         yield process
     finally:

@@ -6,7 +6,8 @@ import signal
 from pathlib import Path
 
 import pytest
-from lab_testing import gnd_lab, has_namespaces, needs_root, own_name, started, wait_until
+from lab_testing import gnd_lab, has_namespaces, needs_root, own_name, started, started_gnd, wait_until
+from load_testing import make_run
 
 from gnd.deploy.errors import LabError
 from gnd.deploy.lab.hosts.data import labs_with_data
@@ -66,6 +67,26 @@ def test_a_lost_database_host_a_cut_region_and_wrong_clocks_lose_nothing(tmp_pat
         assert "check the vehicle's clock, and that of shard shard-" in logs["vehicle-1-0"]
     assert not has_namespaces(name)
     assert name not in labs_with_data()
+
+
+def test_a_load_is_sent_through_the_routers_of_all_regions(tmp_path: Path) -> None:
+    """With certificates, so that clients, hosts and rights fit together; without it is a part of it."""
+    run, keep = make_run(tmp_path / "run"), tmp_path / "kept"
+    options = "--hosts 2 --regions 2 --secure --vehicles 4 --km 0.15 --kmh 180 --per-street 2 --in-flight 8 --drain 300"
+    with started_gnd("load", *options.split(), "--drives", str(run), "--keep", str(keep), "--json", "-") as process:
+        text, err = process.communicate(timeout=LONGEST_S)
+    assert process.returncode == 0, err + text
+    told = json.loads(text)
+    assert told["reports"] == told["acknowledged"] > 15
+    assert told["lost"] == 0
+    late = ("late", "wait for", "within", "grew")  # as a busy machine is
+    assert [one for one in told["why_not"] if not any(word in one for word in late)] == []
+    assert sorted(told["hosts"]) == ["host-0", "host-1"]
+    assert told["secure"] is True
+    assert min(told["cpu_ms_by_part"][part] for part in ("router", "shards", "workers", "database")) > 0
+    assert {"load-0-0", "load-1-2", "router-1"} <= {path.name for path in (keep / "identities").iterdir()}
+    assert [len((keep / f"client-{n}.jsonl").read_text().splitlines()) > 0 for n in (0, 1)] == [True, True]
+    assert not has_namespaces(f"load-{process.pid}")
 
 
 def test_what_a_killed_run_leaves_is_cleaned(tmp_path: Path) -> None:

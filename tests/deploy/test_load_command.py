@@ -18,6 +18,10 @@ def test_what_cannot_be_is_refused_before_anything_starts(tmp_path):
         (["--drives", tmp_path], "holds no run"),
         (["--settled", run], "--settled goes with --drives"),
         (["--drives", run, "--changed-share", 0.5], "--settled RUN"),
+        (["--drives", run, "--secure", "--vehicles", 501], "500 is the most"),
+        (["--drives", run, "--regions", 2], "--regions goes with --hosts"),
+        (["--drives", run, "--hosts", 4, "--shards", 2], "--shards does not go with --hosts: there is one a region"),
+        (["--drives", run, "--hosts", 4, "--store", "sqlite:s"], "--store does not go with --hosts"),
     ):
         result = said(*wrong)
         assert isinstance(result.exception, LoadError)
@@ -43,5 +47,9 @@ def test_the_table_tells_what_is_not_known(merged):
     figures |= {"cpu_ms_by_part": {"workers": 12.5 if merged else None}}
     cells = [str(cell) for column in table_of(figures).columns for cell in column.cells]
     assert ("12.5 ms: workers 12.5" in cells) == merged
+    assert "hosts" not in cells
+    several = table_of(figures | {"hosts": {"host-0": ["router-0", "hub"], "host-1": ["shard-0"]}, "secure": True})
+    assert several.title == "1 vehicles, with certificates"
+    assert "host-0: router-0, hub; host-1: shard-0" in [str(cell) for row in several.columns for cell in row.cells]
     assert ("not known: not all was merged" in cells) != merged
     assert ("no: the queue grew" in cells) != merged

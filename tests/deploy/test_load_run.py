@@ -27,10 +27,10 @@ pytestmark = pytest.mark.xdist_group("fleets")
 OPTIONS = LoadOptions(vehicles=4, km=0.25, kmh=180.0, per_street=2, shards=1, clients=1, in_flight=8)
 
 
-def loaded(tmp_path, options, store=None, look=lambda *_: None):
+def loaded(tmp_path, options, store=None, look=lambda *_: None, **given):
     run, folder = make_run(tmp_path / "run"), tmp_path / "load"
     folder.mkdir()
-    return run_load(options, KeptRuns(run), folder, look, threading.Event(), store), folder
+    return run_load(options, KeptRuns(run), folder, look, threading.Event(), store, **given), folder
 
 
 class LookForCompiler:
@@ -51,9 +51,14 @@ class LookForCompiler:
 
 @pytest.mark.slow
 def test_a_cloud_keeps_up_with_a_few_vehicles(tmp_path):
+    """With certificates; without it is tested with a database."""
     compiler = LookForCompiler(tmp_path / "load")
-    outcome, folder = loaded(tmp_path, OPTIONS, look=compiler)
+    outcome, folder = loaded(tmp_path, OPTIONS, look=compiler, secure=True)
     told = summary(outcome)
+    assert told["secure"] is True
+    assert outcome.unsigned == 0
+    names = {path.name for path in (folder / "identities").iterdir()}
+    assert {"router", "store", "merger-0", "fleet", "load-0-0", "load-0-3"} <= names
     assert told["why_not"] == []
     assert told["kept_up"] is True
     assert {"store", "merger-0", "merger-0's worker"} <= compiler.seen
@@ -82,6 +87,7 @@ def test_a_database_keeps_up_too_and_its_server_is_a_part_of_the_cost(tmp_path, 
     assert told["why_not"] == []
     assert told["reports"] == told["acknowledged"] == outcome.planned > 25
     assert told["lost"] == 0
+    assert (told["secure"], outcome.unsigned) == (False, None)
     assert not (folder / "store.sqlite").exists()
     with open_store(database, create=False) as store:
         journaled = {row.report_id for row in store.reports()}

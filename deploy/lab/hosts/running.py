@@ -207,7 +207,9 @@ def running_hosts(
                 make_bucket()
                 move_out(store, PLACE)
         _until(lambda: _has_standby(cloud), "the standby follows")
-        cloud.start(with_identities(plan, folders, cloud_processes(plan, shard)))
+        parts = with_identities(plan, folders, cloud_processes(plan, shard))
+        stack.callback(cloud.stop, [spec.name for spec in parts])  # before the database, for which shards would wait
+        cloud.start(parts)
         with open_bus(BusConfig(connect=(plan.hub,), open_timeout_s=READY_S, identity=own), name="probe") as bus:
             bus.request(tile_key(LAYER, tile), b"", kind="tile", timeout_s=READY_S)
         stack.enter_context(repeated(lambda _n: cloud.poll(), POLL_S, "supervisor"))
