@@ -212,6 +212,7 @@ class Serving(Part):
         except SealError as error:
             sealing.note_refused(key, error)
             if isinstance(error, ClocksDiffer):  # refused for good, a report would be given up by its vehicle
+                _FAILURES.warning("%s is to be asked again: %s", key, error)
                 raise Busy(str(error), CLOCK_RETRY_S, "clock") from None
             raise
 

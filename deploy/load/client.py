@@ -54,7 +54,7 @@ class ClientConfig:
     runs: KeptRuns
     connect: tuple[str, ...]
     folder: Path
-    identities: Path | None = None
+    identities: Path | None
 
     @property
     def name(self) -> str:

@@ -299,7 +299,8 @@ def test_while_a_clock_is_so_wrong_that_seals_do_not_count_reports_may_wait() ->
     assert waited.back_s == pytest.approx(14.8 - waited.ended_s)
     fault = BY_FAULT["boot-shard-host"]
     assert [fault.is_untimely(s) for s in (900.0, -600.0, 599.0)] == [True, True, False]
-    assert not BY_FAULT["clock-shard-host"].is_untimely(900.0), "keys that were agreed on hold"
+    assert BY_FAULT["clock-vehicles"].is_untimely(900.0)
+    assert not BY_FAULT["clock-router-host"].is_untimely(900.0), "it looks at no seal"
 
 
 def test_with_certificates_all_endpoints_are_private_and_everybody_has_a_name() -> None:

@@ -65,8 +65,10 @@ class HostFault:
         return self.way in ("clock", "boot", "drift")
 
     def is_untimely(self, clock_s: float) -> bool:
-        """Whether no new seal of a part with a clock that is so wrong counts, or none that comes to it."""
-        return self.way == "boot" and abs(clock_s) >= MOST_SKEW_S
+        """Whether no new seal of a part with a clock that is so wrong counts, or none that comes to it. Keys that were
+        agreed on hold, but only as long as no district changes its owner.
+        """
+        return self.way in ("clock", "boot") and self.part in ("shard", VEHICLES) and abs(clock_s) >= MOST_SKEW_S
 
 
 @dataclass(frozen=True, slots=True)
