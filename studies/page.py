@@ -4,7 +4,6 @@ import gzip
 import json
 import os
 import shlex
-import shutil
 import statistics
 import subprocess
 import sys
@@ -12,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -23,8 +22,7 @@ import numpy as np
 from gnd.deploy.chaos.street import read_street
 from gnd.deploy.load.cpu import children, cpu_s
 from gnd.deploy.serve.app import PAGE
-from gnd.deploy.serve.command import PageSource, serve_page
-from gnd.deploy.serve.guard import PageAddress
+from gnd.deploy.serve.command import PageSource
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.router import open_router
@@ -34,19 +32,17 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import update_key
 from gnd.schemas.updates import TileUpdate
 from gnd.tile_store.sqlite_store import SqliteStore
+from studies.frame.browser import PATIENCE_S, opened_browser, opened_window, served_page, until
 from studies.frame.errors import BrowserError
 from studies.frame.measure import Figure
 from studies.frame.options import check, option
 
-SOFTWARE_GL: Final = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
-WINDOW: Final = {"width": 1280, "height": 800}
 AS_DRAWN: Final = "{}"
 ELLIPSOIDS: Final = "{near_m: 1e6, disc_m: 1e6, fine_m: 1e6}"
 SINGLY: Final = "{fine_m: 1e6}"
 """What the page draws how (m, see `Tiles` in page/src): as it does by itself, all as ellipsoids, nothing merged."""
 STREET_M: Final = 40.0
 """From so far somebody looks at a place in a street."""
-_PATIENCE_S: Final = 600.0
 _BATCH: Final = 2_000
 
 
@@ -72,7 +68,7 @@ OPTIONS: Final = PageOptions
 def run(options: PageOptions | None = None) -> list[Figure]:
     """Measure in Chromium."""
     options = options or PageOptions()
-    with tempfile.TemporaryDirectory() as name, _browser() as browser:
+    with tempfile.TemporaryDirectory() as name, opened_browser() as browser:
         folder = Path(name)
         found = [_size(), *_street(browser, folder, options)]
         if options.fleet:
@@ -86,34 +82,6 @@ def _size() -> Figure:
     folder = files("gnd.deploy.serve") / "page"
     sizes = [len(gzip.compress((folder / name).read_bytes(), 9)) for name in PAGE]
     return Figure("the page's own bytes", sum(sizes) / 1000, "kB", "in gzip")
-
-
-@contextmanager
-def _browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright  # for developers alone
-
-    program = shutil.which("chromium") or shutil.which("google-chrome")
-    if program is None:
-        raise BrowserError("no chromium is installed: apt-get install chromium")
-    with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=program, args=list(SOFTWARE_GL))
-        yield browser
-        browser.close()
-
-
-@contextmanager
-def _served(source: PageSource) -> Iterator[str]:
-    """The address of the page, served by threads of this process."""
-    stop, found = threading.Event(), list[str]()
-    thread = threading.Thread(target=serve_page, args=(source, PageAddress(), stop, found.append))
-    thread.start()
-    while thread.is_alive() and not found:
-        time.sleep(0.01)
-    try:
-        yield found[0]
-    finally:
-        stop.set()
-        thread.join()
 
 
 def _moved(tile: Tile, to: TileId) -> Tile:
@@ -139,13 +107,13 @@ def _street(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
         store = stack.enter_context(SqliteStore(path))
         bus = stack.enter_context(open_bus(BusConfig(connect=(endpoint,)), name="study"))
         store.put_tiles(list(_row(some, n)))
-        url = stack.enter_context(_served(PageSource(path, connect=endpoint)))
-        tab, complaints = _window(browser)
+        url = stack.enter_context(served_page(PageSource(path, connect=endpoint)))
+        tab, complaints = opened_window(browser)
         begin_s = time.monotonic()
         tab.goto(url)
-        _until(tab, "gndPage.firstPicture_ms > 0")
+        until(tab, "gndPage.firstPicture_ms > 0")
         picture_s = time.monotonic() - begin_s
-        _until(tab, f"!gndPage.state.isLoading && gndPage.state.gaussians >= {options.gaussians}")
+        until(tab, f"!gndPage.state.isLoading && gndPage.state.gaussians >= {options.gaussians}")
         shown = int(tab.evaluate("gndPage.state.gaussians"))
         found = [
             Figure("first picture after the page was asked for", picture_s, "s", f"{shown} Gaussians"),
@@ -156,14 +124,6 @@ def _street(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
             raise BrowserError(f"the page complains {len(complaints)} times, first: {complaints[0]}")
         tab.close()
         return found
-
-
-def _window(browser: Any) -> tuple[Any, list[str]]:
-    """An empty tab, and what is complained of in it later on: a shader that does not compile draws quickly."""
-    tab, complaints = browser.new_page(viewport=WINDOW), list[str]()
-    tab.on("console", lambda one: complaints.append(one.text) if one.type == "error" else None)
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    return tab, complaints
 
 
 def _frames(tab: Any, shown: int, seconds: float) -> list[Figure]:
@@ -177,7 +137,7 @@ def _frames(tab: Any, shown: int, seconds: float) -> list[Figure]:
 def _fleet(browser: Any, folder: Path, arguments: str) -> list[Figure]:
     """From the line in which a fleet that has just started tells the page's address to the first picture of it."""
     command = [sys.executable, "-m", "gnd.deploy.cli", "fleet", *shlex.split(arguments), "--out", str(folder / "run")]
-    tab, _ = _window(browser)  # that nothing listens yet is no complaint
+    tab, _ = opened_window(browser)  # that nothing listens yet is no complaint
     with subprocess.Popen(  # noqa: S603  (a program of ours)
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -189,7 +149,7 @@ def _fleet(browser: Any, folder: Path, arguments: str) -> list[Figure]:
                 raise BrowserError("the fleet has ended without a page")
             threading.Thread(target=process.stderr.read, daemon=True).start()  # nobody waits on a full pipe
             _open_patiently(tab, url)
-            _until(tab, "gndPage.firstPicture_ms > 0")
+            until(tab, "gndPage.firstPicture_ms > 0")
             picture_s = time.monotonic() - begin_s
             shown = int(tab.evaluate("gndPage.state.gaussians"))
         finally:
@@ -204,14 +164,14 @@ def _open_patiently(tab: Any, url: str) -> None:
     """Open a page whose server is just starting."""
     from playwright.sync_api import Error  # for developers alone
 
-    deadline_s = time.monotonic() + _PATIENCE_S
+    deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
             tab.goto(url)
             return
         except Error as error:
             if time.monotonic() > deadline_s:
-                raise BrowserError(f"nothing listens at {url} within {_PATIENCE_S:.0f} s") from error
+                raise BrowserError(f"nothing listens at {url} within {PATIENCE_S:.0f} s") from error
             time.sleep(0.02)
 
 
@@ -236,13 +196,13 @@ def _crowd(browser: Any, folder: Path, n: int, seconds: float) -> list[Figure]:
     path = folder / f"{n}.sqlite"
     with SqliteStore(path) as store:
         store.put_tiles(list(_row(some, -(-n // len(some.gaussians)))))
-    with _served(PageSource(path)) as url:
-        tab, complaints = _window(browser)
+    with served_page(PageSource(path)) as url:
+        tab, complaints = opened_window(browser)
         begin_s = time.monotonic()
         tab.goto(url)
-        _until(tab, "gndPage.firstPicture_ms > 0")
+        until(tab, "gndPage.firstPicture_ms > 0")
         picture_s = time.monotonic() - begin_s
-        _until(tab, "!gndPage.state.isLoading")
+        until(tab, "!gndPage.state.isLoading")
         loaded_s = time.monotonic() - begin_s
         found = [
             Figure(f"first picture, {n} Gaussians", picture_s, "s"),
@@ -278,7 +238,7 @@ def _updates(tab: Any, store: SqliteStore, bus: Bus, some: Tile, n: int) -> list
             raise BrowserError(f"version {done.version} is not in the store")
         update = TileUpdate(some.tile_id, "ndt", new.version, old.version, new.sha, old.sha, "base")
         bus.publish(update_key("ndt", some.tile_id), update.encode(), kind="update")
-        _until(tab, f"gndPage.updates.length > {known + number} && gndPage.updates.at(-1).drawn_ms > 0")
+        until(tab, f"gndPage.updates.length > {known + number} && gndPage.updates.at(-1).drawn_ms > 0")
     told = tab.evaluate("gndPage.updates")[known:]
     drawn_s = [(one["drawn_ms"] - one["created_ms"]) / 1000 for one in told if one["drawn_ms"]]
     detail = f"{len(drawn_s)} updates of {len(g)} Gaussians"
@@ -298,14 +258,14 @@ def _city(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
         for first in range(0, len(rows), _BATCH):
             store.put_tiles(rows[first : first + _BATCH])
     begin_s = time.monotonic()
-    with _served(PageSource(path)) as url:
+    with served_page(PageSource(path)) as url:
         ready_s = time.monotonic() - begin_s
-        tab, complaints = _window(browser)
+        tab, complaints = opened_window(browser)
         begin_s = time.monotonic()
         tab.goto(url)
-        _until(tab, "gndPage.firstPicture_ms > 0")
+        until(tab, "gndPage.firstPicture_ms > 0")
         usable_s = time.monotonic() - begin_s
-        _until(tab, "!gndPage.state.isLoading")
+        until(tab, "!gndPage.state.isLoading")
         whole_s = time.monotonic() - begin_s
         sizes = tab.evaluate("JSON.stringify(performance.getEntriesByType('resource').map(one => one.encodedBodySize))")
     if complaints:
@@ -317,11 +277,3 @@ def _city(browser: Any, folder: Path, options: PageOptions) -> list[Figure]:
         Figure("city: all in view is loaded after", whole_s, "s", "the 512 nearest tiles"),
         Figure("city: bytes until then", sum(json.loads(sizes)) / 1000, "kB", told),
     ]
-
-
-def _until(tab: Any, holds: str) -> None:
-    deadline_s = time.monotonic() + _PATIENCE_S
-    while not tab.evaluate(f"!!window.gndPage && ({holds})"):
-        if time.monotonic() > deadline_s:
-            raise BrowserError(f"not within {_PATIENCE_S:.0f} s: {holds}")
-        tab.wait_for_timeout(10)
