@@ -34,10 +34,13 @@ export class Overview {
     this.tint(this.background);
   }
 
-  /** Little colour on that of the background. */
+  /** Little colour on that of the background: mixed as the eye sees it, for half a lamp's light is no half of the brightness. */
   tint(background: THREE.Color): void {
     this.background = background;
-    const [still, changed] = [palette.change.surveyed, palette.change.new].map((one) => background.clone().lerp(new THREE.Color(one), 0.14));
+    const seen = background.clone().convertLinearToSRGB();
+    const [still, changed] = [palette.change.surveyed, palette.change.new].map((one) =>
+      seen.clone().lerp(new THREE.Color(one).convertLinearToSRGB(), 0.14).convertSRGBToLinear(),
+    );
     const colours = this.mesh?.geometry.getAttribute("color");
     if (!colours) return;
     this.hasChanged.forEach((isOne, i) => {
@@ -74,6 +77,29 @@ function arrow(): THREE.BufferGeometry {
   return geometry;
 }
 
+const LABEL_PX = 24;
+
+interface Label {
+  element: HTMLElement;
+  /** Of the middle of its lower edge, pixels. */
+  x: number;
+  y: number;
+  far: number;
+}
+
+/** Labels that would cover each other stand above each other, that of the nearest lowest. */
+function putLabels(labels: Label[]): void {
+  for (const one of labels) one.element.hidden = false;
+  const put: { x: number; y: number; half: number }[] = [];
+  for (const one of labels.sort((a, b) => a.far - b.far)) {
+    const half = one.element.offsetWidth / 2 + 2;
+    const covered = () => put.find((other) => Math.abs(other.x - one.x) < half + other.half && Math.abs(other.y - one.y) < LABEL_PX);
+    for (let other = covered(); other; other = covered()) one.y = other.y - LABEL_PX;
+    put.push({ x: one.x, y: one.y, half });
+    one.element.style.transform = `translate(-50%, -100%) translate(${one.x.toFixed(1)}px, ${one.y.toFixed(1)}px)`;
+  }
+}
+
 /** Vehicles as arrows with a label each. */
 export class Vehicles {
   readonly group = new THREE.Group();
@@ -97,27 +123,24 @@ export class Vehicles {
 
   /** Places the arrows as at a time (Infinity: now) and their labels as the camera sees them. */
   draw(time_ms: number, camera: THREE.Camera, width: number, height: number): void {
+    const seen: Label[] = [];
     for (const [name, vehicle] of this.known) {
       const at = time_ms === Infinity ? vehicle.at : placeAt(this.ways[name] ?? [], time_ms);
       const mark = this.mark(name, vehicle);
       const isThere = this.isShown && at !== null;
       mark.mesh.visible = isThere;
-      mark.label.hidden = !isThere;
+      mark.label.hidden = true;
       if (!at || !isThere) continue;
       mark.mesh.position.set(at[1], at[2], at[3] + 1.2);
       const heading = time_ms === Infinity ? vehicle.heading_rad : headingAt(this.ways[name] ?? [], time_ms);
       mark.mesh.rotation.z = heading ?? 0;
       const far = camera.position.distanceTo(mark.mesh.position);
       mark.mesh.scale.setScalar(Math.max(1, far / 90));
-      this.put(mark.label, mark.mesh.position.clone().add(new THREE.Vector3(0, 0, 2 + far / 60)), camera, width, height);
+      const p = mark.mesh.position.clone().add(new THREE.Vector3(0, 0, 2 + far / 60)).project(camera);
+      const isSeen = p.z < 1 && Math.abs(p.x) < 1.1 && Math.abs(p.y) < 1.1;
+      if (isSeen) seen.push({ element: mark.label, x: ((p.x + 1) / 2) * width, y: ((1 - p.y) / 2) * height, far });
     }
-  }
-
-  private put(label: HTMLElement, at: THREE.Vector3, camera: THREE.Camera, width: number, height: number): void {
-    const p = at.project(camera);
-    const isSeen = p.z < 1 && Math.abs(p.x) < 1.1 && Math.abs(p.y) < 1.1;
-    label.hidden = !isSeen;
-    if (isSeen) label.style.transform = `translate(-50%, -100%) translate(${(((p.x + 1) / 2) * width).toFixed(1)}px, ${(((1 - p.y) / 2) * height).toFixed(1)}px)`;
+    putLabels(seen);
   }
 
   private mark(name: string, vehicle: Vehicle) {
@@ -245,8 +268,10 @@ function strokes(features: Feature[]): THREE.Object3D {
 
 /** A frame of one metre around what is selected. */
 export function selection(): THREE.LineSegments {
-  const box = new THREE.EdgesGeometry(new THREE.BoxGeometry(1.15, 1.15, 1.15));
-  const mesh = new THREE.LineSegments(box, new THREE.LineBasicMaterial({ color: "#ffffff", depthTest: false }));
+  // Lines are one pixel wide, however fine the screen is: some beside each other.
+  const at = [1.12, 1.14, 1.16, 1.18].flatMap((side) => [...new THREE.EdgesGeometry(new THREE.BoxGeometry(side, side, side)).getAttribute("position").array]);
+  const boxes = new THREE.BufferGeometry().setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
+  const mesh = new THREE.LineSegments(boxes, new THREE.LineBasicMaterial({ color: "#ffffff", depthTest: false }));
   mesh.visible = false;
   mesh.renderOrder = 5;
   return mesh;

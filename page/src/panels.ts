@@ -11,7 +11,7 @@ export function voxelPanel(story: Story): Node[] {
   const head = facts([
     ["Tile", make("span", {}, story.path)],
     ["Voxel", String(story.voxel)],
-    ["Version of the tile", String(story.version)],
+    ["Tile version", String(story.version)],
     ["Place", `${story.lat_deg.toFixed(6)}°, ${story.lon_deg.toFixed(6)}°`],
     ["Height", `${story.height_m.toFixed(1)} m`],
     ...(g
@@ -30,7 +30,7 @@ export function voxelPanel(story: Story): Node[] {
         make("strong", {}, one.vehicle ?? "unknown vehicle"),
         one.says ? ` says ${one.says}` : "",
         make("div", { class: "soft num" }, `driven ${when(one.driven_ms)}`),
-        one.rays && make("div", { class: "soft num" }, `rays: ${raysOf(one.rays)}`),
+        one.rays && raysOf(one.rays) && make("div", { class: "soft num" }, `rays: ${raysOf(one.rays)}`),
       ),
     );
     return make(
@@ -44,8 +44,10 @@ export function voxelPanel(story: Story): Node[] {
   return [head, ...steps];
 }
 
+/** The rays that there were; "" where a voxel is new, and none is counted. */
 function raysOf(rays: Record<string, number>): string {
   return Object.entries(rays)
+    .filter(([, n]) => n > 0)
     .map(([name, n]) => `${n} ${name.replaceAll("_", " ")}`)
     .join(", ");
 }

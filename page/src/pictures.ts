@@ -82,7 +82,8 @@ export class Pictures {
       scene.add(mesh);
       made.push(drawable);
     }
-    const far = reach / Math.tan((VIEW_DEG * Math.PI) / 360);
+    const fits = Math.max(3, 0.36 * one.length_m + 0.42 * one.tall_m + 1.5); // looked at askance, a length is less high
+    const far = fits / Math.tan((VIEW_DEG * Math.PI) / 360);
     this.camera.position.copy(middle).addScaledVector(FROM, far);
     this.camera.lookAt(middle);
     const picture = this.rendered(scene);

@@ -105,7 +105,7 @@ export class WorkList {
     const size = `${one.length_m.toFixed(1)} × ${one.width_m.toFixed(1)} × ${one.tall_m.toFixed(1)} m`;
     const who = one.vehicles === null ? "from a survey" : `${many(one.vehicles, "vehicle")}, ${many(one.reports, "report")}`;
     const head = make("span", { class: "head" }, swatch(COLOURS[one.change]), nameOf(one));
-    const button = make("button", { type: "button", class: "item" }, head, make("span", { class: "soft num" }, `${size}, ${many(one.voxels, "voxel")}; ${who}`));
+    const button = make("button", { type: "button", class: "item" }, head, make("span", { class: "soft num" }, `${size}, ${many(one.voxels, "voxel")}`, make("br"), who));
     button.addEventListener("click", () => this.go(one));
     const card = make("li", { class: "card" }, button);
     if (one.parts.length) button.append(this.shots(one));

@@ -1,7 +1,7 @@
 """The page in a real browser: it draws, follows, compares, tells what one clicks on, and is not fooled by names."""
 
 import io
-import shutil
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from page_testing import EAST, HERE, LiveStreet, ServedPage, live_street, served, street_tile
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+from studies.frame.browser import chromium, opened_browser
+
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 AXE = Path(__file__).parents[3] / "page" / "node_modules" / "axe-core" / "axe.min.js"
-SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 PATIENCE_S = 120.0
 """For a machine on which others work; how fast the page is, `python -m studies serve` measures."""
 
-ORANGE = (239, 156, 29)
+VERMILION = (213, 94, 0)
 FORGERY = """<!doctype html><iframe name=hidden></iframe>
 <form action="TARGET" method=post enctype="text/plain" target=hidden>
 <input name='{"judgement": "roll_back", "why": "' value='"}'></form>
@@ -37,16 +37,14 @@ Promise.all([send({mode: "no-cors"}), send({mode: "cors", headers: {"content-typ
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.timeout(600),
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed"),
+    pytest.mark.skipif(chromium() is None, reason="no chromium is installed"),
 ]
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as started:
-        opened = started.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
+    with opened_browser() as opened:
         yield opened
-        opened.close()
 
 
 class Window:
@@ -151,13 +149,13 @@ def test_it_draws_the_map_follows_it_and_stays_over_a_lost_router(
     )
     before = window.pixels()
     assert near(before, (174, 181, 186)) > 0.02 * before[:, :, 0].size, "the ground is grey"
-    assert near(before, ORANGE) == 0, "nothing is new"
+    assert near(before, VERMILION) == 0, "nothing is new"
 
     street.merge(street_tile(EAST, wall=True))
     window.until(lambda state: any(one["drawn_ms"] for one in state["updates"]), "an update is drawn")
     window.tab.wait_for_timeout(3500)  # the flash is over
     window.drawn()
-    assert near(window.pixels(), ORANGE) > 200, "the new wall is orange"
+    assert near(window.pixels(), VERMILION) > 200, "the new wall is vermilion"
 
     street.stop_router()
     street.start_router()
@@ -271,7 +269,7 @@ def test_changes_are_decided_from_the_work_list_with_pictures(
         with_wall = window.drawn()["gaussians"]
         window.tab.click("#tab-changes")
         before, after = shots_of(window, "New wall")
-        assert (near(before, ORANGE), near(after, ORANGE) > 500) == (0, True), "the wall is in the second picture alone"
+        assert (near(before, VERMILION), near(after, VERMILION) > 500) == (0, True), "it is in the second picture alone"
         before, after = shots_of(window, "Gone wall")
         assert np.abs(before - after).max() > 60
 
@@ -343,6 +341,24 @@ def test_a_store_with_a_hostile_name_is_a_title_like_any_other(
         window.drawn()
         assert window.tab.locator("#title").inner_text() == copy.name
         assert window.complaints == []
+
+
+def test_labels_of_vehicles_at_one_place_do_not_cover_each_other(
+    open_page: Callable[..., Window], page: ServedPage
+) -> None:
+    window = open_page(page.url)
+    window.drawn()
+    at = window.tab.evaluate("gndPage.view.controls.target.toArray()")
+    vehicles = [{"name": f"vehicle-{n:02d}", "at": [0, at[0] + 0.5 * n, *at[1:]], "heading_rad": None, "odometer_m": 1,
+                 "health": "good", "tiles": 0, "reports": 0, "doubts": 0} for n in range(4)]  # fmt: skip
+    window.tab.evaluate("message => gndPage.hear(message)", {"type": "vehicles", "vehicles": vehicles})
+    window.tab.locator("#labels .label:not([hidden])").nth(3).wait_for(timeout=60_000)
+    window.tab.wait_for_timeout(500)
+    boxes = [label.bounding_box() for label in window.tab.locator("#labels .label").all()]
+    for a, b in itertools.combinations(boxes, 2):
+        is_beside = a["x"] + a["width"] <= b["x"] or b["x"] + b["width"] <= a["x"]
+        assert is_beside or a["y"] + a["height"] <= b["y"] or b["y"] + b["height"] <= a["y"], (a, b)
+    assert max(box["y"] for box in boxes) - min(box["y"] for box in boxes) < 120, "they stand close together"
 
 
 @pytest.mark.parametrize("scheme", ["dark", "light"])
