@@ -73,6 +73,11 @@ RECIPES: Final = (
     ),
     Recipe("healing", ("gnd fleet --world-seed 21 --no-page --out run",), {"run/healing.png": "healing.png"}),
     Recipe(
+        "page",
+        ("gnd fleet --agents 2 --no-page --out run", "python -m tools.page_pictures run taken"),
+        {f"taken/page_{name}.jpg": f"page_{name}.jpg" for name in ("dark", "compare", "light", "decide")},
+    ),
+    Recipe(
         "localise",
         (
             "gnd sim world write street.json --seed 11",
@@ -170,10 +175,6 @@ RECIPES: Final = (
 )
 BY_HAND: Final = {
     "architecture.svg": "written by hand, as text",
-    "page_dark.jpg": "`gnd serve` of a run of two vehicles: the browser's own picture of the page",
-    "page_compare.jpg": "the same, key B",
-    "page_light.jpg": "the same in light colours, after a click on a voxel, with the traffic",
-    "page_decide.jpg": "`gnd serve run --allow-changes`, the first change of the list",
 }
 """Pictures that no command draws, and how they came to be."""
 
