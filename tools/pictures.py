@@ -131,7 +131,6 @@ RECIPES: Final = (
         "codec",
         ("gnd reproduce codec --recordings DATA --families street,roundabout --out codec",),
         {"codec/codec.png": "codec_rates.png"},
-        long=True,
     ),
     Recipe(
         "simulation",

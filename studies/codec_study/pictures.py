@@ -2,20 +2,23 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from gnd.picture_style import BLUE, GREY, INK
+from gnd.picture_style import BLUE, GREY, INK, RED
 from studies.frame.figures import dress, finish, new_figure
+
+_COLOURS: Final = {"by sets": BLUE, "by sums": RED}
+"""Of codecs, by how their names end; all others are grey."""
 
 
 def draw(found: Mapping[str, Any], folder: Path) -> Path:
-    """One point a scene and codec: grey those without, blue those by sets of tables; hollow what was learnt from."""
+    """One point a scene and codec, in colours by what codes them; hollow what was learnt from."""
     figure = new_figure(9.6, 5.6)
     axes = figure.subplots()
     for name, scene in found["scenes"].items():
         marker = "o" if scene["kind"].startswith("real") else "s"
         for codec_name, one in scene["codecs"].items():
-            colour = BLUE if codec_name.endswith("sets") else GREY
+            colour = next((one for end, one in _COLOURS.items() if codec_name.endswith(end)), GREY)
             face = "none" if "learnt" in scene["kind"] else colour
             axes.plot(one["bytes"], one["shift_cm"]["p95"], marker, color=colour, markerfacecolor=face)
             if codec_name == "standard, range coded by sets":
@@ -27,7 +30,7 @@ def draw(found: Mapping[str, Any], folder: Path) -> Path:
     axes.set_xlim(left=1.5)
     dress(axes, "bytes a voxel", "95 % of pose shifts, cm")
     note = (
-        "blue: codecs 8 to 10, grey: 2 to 4 and 11 to 13; circles: recordings, hollow: learnt from, squares: simulated;"
-        " dashed: the standard codec's must on real streets"
+        "grey: codecs 2 to 4, blue: 8 to 10, red: 11 to 13; circles: real, hollow: learnt from, squares: simulated;"
+        " dashed: must on real streets"
     )
     return finish(figure, "What tiles weigh and what rounding costs", note, folder / "codec.png")
