@@ -1,7 +1,7 @@
 """Draw the pictures of the documents anew: `make pictures`, or `make pictures ARGS="world healing"` for some.
 
 The table of docs/pictures.md is this list (`--page` writes it, a test compares them). Pictures of long studies are
-drawn only when they are named, or with --all: their studies take from twenty minutes to hours.
+drawn only when they are named, or with --all: their studies take from eight minutes to hours.
 """
 
 import os
