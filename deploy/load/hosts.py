@@ -16,7 +16,7 @@ from gnd.deploy.lab.lab import Lab
 from gnd.deploy.lab.namespaces import inside
 from gnd.deploy.load.drives import KeptRuns
 from gnd.deploy.load.plan import LoadOptions, shared_out
-from gnd.deploy.load.run import LoadCloud, Tell, load_shard, measured, put_streets, vehicles_of
+from gnd.deploy.load.run import LoadCloud, Tell, measured, put_streets, shard_of_load, vehicles_of
 from gnd.deploy.load.streets import Streets
 from gnd.deploy.load.verdict import LoadOutcome
 from gnd.deploy.processes import start_fork_server
@@ -100,4 +100,4 @@ class LoadOnHosts:
 
 
 def _lab_shard(name: str, url: str, routers: tuple[str, ...]) -> ShardConfig:
-    return replace(load_shard(name, url, routers), bus_lease_ms=BUS_LEASE_MS, lease_s=LEASE_S)
+    return replace(shard_of_load(name, url, routers), bus_lease_ms=BUS_LEASE_MS, lease_s=LEASE_S)

@@ -195,7 +195,7 @@ def put_streets(streets: Streets, store: SqlStore, tell: Tell, stop: threading.E
         sign_map(store)
 
 
-def load_shard(name: str, store: StoreLocation, connect: tuple[str, ...]) -> ShardConfig:
+def shard_of_load(name: str, store: StoreLocation, connect: tuple[str, ...]) -> ShardConfig:
     """A shard of a load: streets lie districts apart, and vehicles that follow each other send the same drives."""
     one = shard_config(FleetConfig(), name, store, connect[0])
     confirmation = replace(one.confirmation, copies=False)
@@ -205,7 +205,7 @@ def load_shard(name: str, store: StoreLocation, connect: tuple[str, ...]) -> Sha
 @contextmanager
 def _cloud(options: LoadOptions, folder: Path, store: StoreLocation, identities: Path | None) -> Iterator[LoadCloud]:
     connect = f"{'tcp' if identities is None else 'tls'}/127.0.0.1:{claim_port(0)}"
-    shards = [load_shard(f"shard-{n}", store, (connect,)) for n in range(options.shards)]
+    shards = [shard_of_load(f"shard-{n}", store, (connect,)) for n in range(options.shards)]
     supervisor = Supervisor(folder, folder / "pids.json")
 
     def start(specs: Iterable[ProcessSpec]) -> None:
