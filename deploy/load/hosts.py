@@ -67,7 +67,8 @@ class LoadOnHosts:
                 running_hosts(self.plan, lab, folders, put_map, _lab_shard) as cloud,
             ):
                 stop.is_awaited = True
-                return measured(self._cloud(cloud, lab), self.options, self.runs, self.folder, tell, stop)
+                options = replace(self.options, shards=self.plan.size.regions)
+                return measured(self._cloud(cloud, lab), options, self.runs, self.folder, tell, stop)
 
     def _groups(self) -> tuple[Group, ...]:
         """A namespace for each client; it is many vehicles, so its link is as fast as the machine."""
