@@ -143,10 +143,9 @@ def near(pixels: np.ndarray, colour: tuple[int, int, int], within: float = 0.12)
 def test_it_draws_the_map_follows_it_and_stays_over_a_lost_router(
     open_page: Callable[..., Window], street: LiveStreet, page: ServedPage
 ) -> None:
-    window = open_page(page.url)
-    assert window.drawn()["gaussians"] == len(street_tile(HERE).gaussians) + len(
-        street_tile(EAST, wall=False).gaussians
-    )
+    window, tiles = open_page(page.url), (street_tile(HERE), street_tile(EAST, wall=False))
+    both = sum(len(tile.gaussians) for tile in tiles)
+    window.until(lambda state: state["gaussians"] == both, "both tiles are drawn")
     before = window.pixels()
     assert near(before, (174, 181, 186)) > 0.02 * before[:, :, 0].size, "the ground is grey"
     assert near(before, VERMILION) == 0, "nothing is new"
