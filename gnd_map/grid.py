@@ -212,7 +212,7 @@ class GridFrame:
     @property
     def u_origin(self) -> float:
         """Continuous tile coordinate of the frame's origin along longitude; gx is unwrapped around it."""
-        return float(tile_coordinates(self.frame.lat_rad, self.frame.lon_rad)[0])
+        return _u_of(self.frame)
 
     def grid_of(self, points_map_m: npt.ArrayLike) -> F64:
         """(N, 3) exact grid coordinates of points (N, 3) in metres in the map frame.
@@ -295,6 +295,11 @@ class GridFrame:
         R_map_local = self.frame.R_ecef_enu.T @ enu_axes(lat, lon)
         A = (R_map_local / self.metres_per_step(g)).T
         return A, g - A @ p
+
+
+@lru_cache(maxsize=1024)
+def _u_of(frame: LocalFrame) -> float:
+    return float(tile_coordinates(frame.lat_rad, frame.lon_rad)[0])
 
 
 @lru_cache(maxsize=1024)

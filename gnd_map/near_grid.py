@@ -49,25 +49,17 @@ def expansion_about(grid_frame: GridFrame, points_map_m: F64, marks: U8) -> Expa
     if not low[0] <= high[0]:
         return None
     middle = 0.5 * (low + high)
-    lat, _, _ = grid_frame.geodetic_of_grid(grid_frame.grid_of(middle[None, :])[0])
-    if float(np.linalg.norm(high - middle)) > RADIUS_M or abs(float(lat)) > _MAX_LAT_RAD:
-        return None
-    return Expansion(middle, *_expansion(grid_frame, middle))
-
-
-def _expansion(grid_frame: GridFrame, middle: F64) -> tuple[F64, F64, F64, F64]:
-    """R_local_map (3, 3), g of the middle (3,), grid steps per radian and metre (3,), and what the curvature needs
-    (5,).
-    """
     g = grid_frame.grid_of(middle[None, :])[0]
     lat, lon, height = grid_frame.geodetic_of_grid(g)
+    if float(np.linalg.norm(high - middle)) > RADIUS_M or abs(float(lat)) > _MAX_LAT_RAD:
+        return None
     R_local_map = enu_axes(lat, lon).T @ grid_frame.frame.R_ecef_enu
     steps = np.array([grid_frame.nx / TILE_RAD, grid_frame.ny / TILE_RAD, 1.0 / VOXEL_M])
     m = meridian_radius_m(lat)
     dm_dlat = 3.0 * m * WGS84_E2 * np.sin(lat) * np.cos(lat) / (1.0 - WGS84_E2 * np.sin(lat) ** 2)
     around_axis = (normal_radius_m(lat) + height) * np.cos(lat)
     curvature = np.array([around_axis, m + height, np.sin(lat), np.cos(lat), dm_dlat], dtype=np.float64)
-    return np.ascontiguousarray(R_local_map), g, steps, curvature
+    return Expansion(middle, np.ascontiguousarray(R_local_map), g, steps, curvature)
 
 
 @kernel

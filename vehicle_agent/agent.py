@@ -5,7 +5,7 @@ from typing import Any
 
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.vehicle_agent.config import AgentConfig
-from gnd.vehicle_agent.memory import keep_small
+from gnd.vehicle_agent.memory import keep_small, keep_what_is_loaded
 from gnd.vehicle_agent.result import write_json
 from gnd.vehicle_agent.vehicle import open_vehicle
 
@@ -27,6 +27,7 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
     """
     keep_small()
     with open_vehicle(config, stop) as vehicle:  # link to the cloud, tiles, outbox, and the pipeline between them
+        keep_what_is_loaded()
         for item in vehicle.drive():  # recording -> measurements in time order
             vehicle.push(item)  # download, localise, segment, detect, report: see `Pipeline.push`
         vehicle.finish()  # what waits in the lags -> the last reports

@@ -71,7 +71,7 @@ def measured(asked: dict[str, Any]) -> dict[str, Any]:
     start: dict[str, float] = {"interpreter": _BEGUN_CPU_S}
     compiled: list[float] = []
     from gnd.deploy.bench.stopwatch import Stopwatch
-    from gnd.vehicle_agent.memory import keep_small
+    from gnd.vehicle_agent.memory import keep_small, keep_what_is_loaded
     from gnd.vehicle_agent.settings import agent_of
     from gnd.vehicle_agent.vehicle import open_vehicle
 
@@ -83,6 +83,7 @@ def measured(asked: dict[str, Any]) -> dict[str, Any]:
     config = agent_of(asked["settings"], where="bench")
     start["imports"] = time.process_time()
     with open_vehicle(config, threading.Event()) as vehicle:
+        keep_what_is_loaded()
         start["link, cache and recording"] = time.process_time()
         found = _driven(vehicle, stopwatch, start, compiled)
         result = vehicle.result()

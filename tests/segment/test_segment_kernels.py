@@ -12,7 +12,16 @@ from gnd.gnd_map.se3 import exp_so3
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
 from gnd.vehicle_agent.segment.image_kernels import BINS, Optics, RangeJudge, draw_image, layer_gap, vote
 from gnd.vehicle_agent.segment.scene import WEIGHTS, belief, hash_table
-from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW, OUTSIDE, components, find_objects, moving_points
+from gnd.vehicle_agent.segment.voxel_kernels import (
+    GROUND,
+    LOW,
+    MOST_REACH,
+    OUTSIDE,
+    components,
+    components_of,
+    find_objects,
+    moving_points,
+)
 
 GRID = GroundGrid(-20.0, -20.0, 1.0, 40, 40)
 LEVEL = np.array([0.0, 0.0, -1.9, 0.0, 0.0, 1.0])  # the road under the vehicle and its normal
@@ -201,3 +210,21 @@ def test_belief_is_what_dempsters_rule_gives_vote_by_vote(passed: int, met: int,
         m, s, unknown = (x / sum(joint) for x in joint)
     found = belief(np.array([passed], np.uint8), np.array([met], np.uint8), moving, static)
     np.testing.assert_allclose([x[0] for x in found], [m, s], atol=1e-9)
+
+
+@given(
+    st.integers(0, 10_000), st.integers(1, 300), st.sampled_from([2, 4, 9, 30]), st.floats(0.0, 1.0)
+)  # fmt: skip
+@example(7, 300, 4, 0.02)
+def test_components_with_a_seed_are_those_of_all_voxels(seed: int, count: int, wide: int, share: float) -> None:
+    """Against the components of all voxels: the same ones, numbered by their first seeds; the others have no number."""
+    rng = np.random.default_rng(seed)
+    index = np.unique(rng.integers(-wide, wide, (count, 3)) * [1, 1, 3], axis=0).astype(np.int32)
+    index = rng.permutation(index)
+    reach = rng.integers(1, MOST_REACH + 1, len(index)).astype(np.uint8)
+    seeds = rng.random(len(index)) < share
+    whole = components(index, reach, np.ones(len(index), np.bool_), *hash_table(len(index)))
+    number = {label: n for n, label in enumerate(dict.fromkeys(whole[seeds].tolist()))}
+    label, waiting = np.full((2, len(index)), 77, np.int32)
+    components_of(index, reach, seeds, *hash_table(len(index)), label, waiting)
+    assert label.tolist() == [number.get(one, -1) for one in whole.tolist()]

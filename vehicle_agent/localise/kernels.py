@@ -77,9 +77,10 @@ def _nearest(
     """Row and squared Mahalanobis distance of the nearest Gaussian of the voxel and its six face neighbours, or -1."""
     best, best_m2 = -1, gate_m2
     for step in (0, ny * nz, -ny * nz, nz, -nz, 1, -1):
-        row = flat[cell + step]
+        row = flat[np.uint64(cell + step)]
         if row >= 0:
-            m2 = _mahalanobis2(omega[row], q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2])
+            u = np.uint64(row)  # not below 0: no look from the end
+            m2 = _mahalanobis2(omega[u], q0 - mean[u, 0], q1 - mean[u, 1], q2 - mean[u, 2])
             if m2 < best_m2:
                 best, best_m2 = row, m2
     return best, best_m2
@@ -96,7 +97,7 @@ def _known_cell(q0: float, q1: float, q2: float, nx: int, ny: int, nz: int, flat
     if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
         return -1
     cell = (int(gx) * ny + int(gy)) * nz + int(gz)
-    return -1 if flat[cell] < -1 else cell
+    return -1 if flat[np.uint64(cell)] < -1 else cell
 
 
 @bare

@@ -40,6 +40,11 @@ class ClockModel:
         since = stamp_ns - self.at_ns - round(self.offset_s * 1e9)
         return self.at_ns + np.round(since / (1.0 + self.rate)).astype(np.int64) if self.rate else since + self.at_ns
 
+    def of_stamp(self, stamp_ns: int) -> int:
+        """The same of one sample."""
+        since = stamp_ns - self.at_ns - round(self.offset_s * 1e9)
+        return self.at_ns + (round(since / (1.0 + self.rate)) if self.rate else since)
+
 
 class MotionBuffer:
     """The last seconds of wheel speed and yaw rate, integrated as a car moves: along its x axis, turning about z.
@@ -64,7 +69,7 @@ class MotionBuffer:
     @property
     def last_ns(self) -> int:
         """Time of the newest sample by the LiDAR's clock; the buffer must not be empty."""
-        return int(self.clock.of_stamps(np.array([self._t_ns[-1]], np.int64))[0])
+        return self.clock.of_stamp(self._t_ns[-1])
 
     @property
     def last_stamp_ns(self) -> int:

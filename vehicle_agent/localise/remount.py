@@ -29,6 +29,7 @@ UNKNOWN_RAD: Final = float(np.radians(5.0))
 KEPT_SHARE: Final = 0.5
 """An axis that is put right stays so until it may be off by less than this share of what makes it wrong (one sigma)."""
 SETTLED_SCANS: Final = 5
+_MOST_KNOWN: Final = 8
 MOST_WAIT: Final = 3
 """Scans that a first pose waits for the ground where the header cannot be right."""
 
@@ -104,6 +105,7 @@ class Mounting:
         self.watch = MountWatch(self.T_header)
         self._watched = 0
         self._put_right = np.zeros(3, np.bool_)
+        self._used_vehicle: dict[float, F64] = {}  # by yaw, until the mount is seen again: asked for with each scan
 
     @property
     def residual(self) -> MountResidual:
@@ -117,6 +119,7 @@ class Mounting:
         values, sigmas = np.abs(self.residual.values), self.residual.sigmas
         certain = values - SIGMAS * sigmas > TOLERANCE
         self._put_right = certain | (self._put_right & (values - sigmas > KEPT_SHARE * TOLERANCE))
+        self._used_vehicle = {}
 
     @property
     def off(self) -> F64:
@@ -154,6 +157,7 @@ class Mounting:
     def remount(self) -> F64:
         """Use what is known from now on; (4, 4) T_now_before that takes the axes before to those now."""
         before, self.T_used = self.T_used, tilted(self.T_header, self.off)
+        self._used_vehicle = {}
         return np.asarray(self.T_used @ T_inverse(before))
 
     # --- what follows from it ------------------------------------------------------------------------------------
@@ -164,7 +168,13 @@ class Mounting:
 
     def T_used_vehicle(self, yaw_rad: float = 0.0) -> F64:
         """(4, 4) the vehicle, as it lies under the mount as it is, in the axes of `T_used`."""
-        return np.asarray(self.T_used @ T_inverse(self.T_vehicle_lidar(yaw_rad)))
+        known = self._used_vehicle.get(yaw_rad)
+        if known is None:
+            known = np.asarray(self.T_used @ T_inverse(self.T_vehicle_lidar(yaw_rad)))
+            if len(self._used_vehicle) >= _MOST_KNOWN:
+                self._used_vehicle = {}
+            self._used_vehicle[yaw_rad] = known
+        return known
 
     @property
     def wheels_m(self) -> F64:

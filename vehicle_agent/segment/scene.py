@@ -11,7 +11,7 @@ from gnd.gnd_map.arrays import F32, F64, I32, I64
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
 from gnd.vehicle_agent.segment.image_kernels import Optics, RangeJudge, draw_image, elevation_span, layer_gap, vote
 from gnd.vehicle_agent.segment.parameters import RANGE_MIN_M, SegmentParameters
-from gnd.vehicle_agent.segment.voxel_kernels import find_objects
+from gnd.vehicle_agent.segment.voxel_kernels import MOST_REACH, find_objects
 
 I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
@@ -47,7 +47,6 @@ SEGMENT_VOXEL_M: Final = 0.3
 U16 = NDArray[np.uint16]
 
 GAP_SHARE = 0.8  # of layers that are at most so far apart
-MOST_REACH = 8  # voxels
 NS = 1_000_000_000
 ENOUGH = 3  # full votes for "static", none against them
 VISIBLE = 0.8  # of the distance at which the lowest ray meets a level road

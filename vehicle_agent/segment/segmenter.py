@@ -22,7 +22,7 @@ from gnd.vehicle_agent.segment.scene import (
     image_of,
     judge_of,
 )
-from gnd.vehicle_agent.segment.voxel_kernels import components, moving_points
+from gnd.vehicle_agent.segment.voxel_kernels import components, components_of, moving_points
 
 _EVERY_S: Final = 0.3
 """Time between the scans that are kept for comparison."""
@@ -162,9 +162,11 @@ def decide(objects: Objects) -> Mask:
     goes, stays = moving > static, static > moving
     if not goes.any():
         return goes
-    whole = components(objects.index, objects.reach, np.ones(len(goes), np.bool_), *hash_table(len(goes)))
-    n_goes, n_stays = np.bincount(whole, goes), np.bincount(whole, stays)
+    whole, waiting = np.empty((2, len(goes)), np.int32)
+    components_of(objects.index, objects.reach, goes, *hash_table(len(goes)), whole, waiting)
+    with_goes = whole >= 0
+    n_goes, n_stays = np.bincount(whole[with_goes], goes[with_goes]), np.bincount(whole[with_goes], stays[with_goes])
     moves = (n_goes >= _MIN_VOXELS) & (n_goes >= _MOVING_SHARE * (n_goes + n_stays))
     part = components(objects.index, objects.reach, goes, *hash_table(int(goes.sum())))
     large = np.append(np.bincount(part[part >= 0]) >= _PART_VOXELS, False)
-    return np.asarray(moves[whole] | large[part])
+    return np.asarray((with_goes & moves[whole]) | large[part])

@@ -13,6 +13,8 @@ U8 = NDArray[np.uint8]
 
 GROUND, LOW, OUTSIDE = -1, -2, -3
 """What a point is that belongs to no voxel; low points lie between ground and objects."""
+MOST_REACH = 8
+"""Voxels between the heights of two that are joined, at most."""
 _LIMIT = 1 << 20
 _HASH = np.uint64(0x9E3779B97F4A7C15)
 
@@ -143,6 +145,90 @@ def components(index: I32, reach: U8, chosen: NDArray[np.bool_], keys: I64, valu
                 _join(parent, n, values[at])
         _join_above(index, n, reach[n], keys, values, parent)
     return _numbered(parent, chosen)
+
+
+@bare
+def _reached(at: int, keys: I64, values: I32, label: I32, waiting: I32, depth: int, number: int) -> tuple[bool, int]:
+    """Whether there is a voxel at a place of the table; one without a number gets it, and waits."""
+    if keys[at] == -1:
+        return False, depth
+    n = values[at]
+    if label[n] < 0:
+        label[n] = number
+        waiting[depth] = n
+        depth += 1
+    return True, depth
+
+
+@bare
+def _has_above(i: int, j: int, k: int, keys: I64) -> bool:
+    """Whether one of the nine voxels above is there."""
+    found = False
+    for column in range(9):
+        found = found or keys[_slot(keys, _key(i + column // 3 - 1, j + column % 3 - 1, k + 1))] != -1
+    return bool(found)
+
+
+@bare
+def _wait_around(
+    index: I32, n: int, reach: U8, keys: I64, values: I32, label: I32, waiting: I32, depth: int, number: int
+) -> int:
+    """Let the voxels wait that are joined with `n`, the same ones as in `components`; gives how many wait."""
+    i, j, k = index[n, 0], index[n, 1], index[n, 2]
+    above, below = False, False
+    for column in range(9):
+        a, b = i + column // 3 - 1, j + column % 3 - 1
+        if column != 4:
+            _, depth = _reached(_slot(keys, _key(a, b, k)), keys, values, label, waiting, depth, number)
+        found, depth = _reached(_slot(keys, _key(a, b, k + 1)), keys, values, label, waiting, depth, number)
+        above = above or found
+        found, depth = _reached(_slot(keys, _key(a, b, k - 1)), keys, values, label, waiting, depth, number)
+        below = below or (found and column == 4)
+    for up in range(2, reach[n] + 1):
+        if above:
+            break
+        above, depth = _reached(_slot(keys, _key(i, j, k + up)), keys, values, label, waiting, depth, number)
+    for down in range(2, MOST_REACH + 1):  # who looks up from below, and finds nothing nearer, finds this one
+        if below:
+            break
+        at = _slot(keys, _key(i, j, k - down))
+        below = bool(keys[at] != -1)
+        if below and reach[values[at]] >= down and not _has_above(i, j, k - down, keys):
+            _, depth = _reached(at, keys, values, label, waiting, depth, number)
+    return depth
+
+
+@bare
+def components_of(
+    index: I32, reach: U8, seeds: NDArray[np.bool_], keys: I64, values: I32, label: I32, waiting: I32
+) -> None:
+    """Fill `label` (V,) with the number of the component of each voxel that is joined with a seed, -1 for the others:
+    what `components` gives of all voxels, only that no time is spent on components without a seed.
+
+    Args:
+        index: (V, 3) int32 of the voxels, each once.
+        reach: (V,) as of `components`, at most `MOST_REACH`.
+        seeds: (V,) bool. Components are numbered in the order of their first seeds.
+        keys: empty hash table for all voxels.
+        values: of the same length.
+        label: (V,) int32, filled.
+        waiting: (V,) int32, room.
+    """
+    for n in range(len(index)):
+        label[n] = -1
+        key = _key(index[n, 0], index[n, 1], index[n, 2])
+        at = _slot(keys, key)
+        keys[at], values[at] = key, n
+    number = 0
+    for seed in range(len(index)):
+        if not seeds[seed] or label[seed] >= 0:
+            continue
+        label[seed] = number
+        waiting[0], depth = seed, 1
+        while depth > 0:
+            depth -= 1
+            depth = _wait_around(index, waiting[depth], reach, keys, values, label, waiting, depth, number)
+        number += 1
 
 
 @kernel
