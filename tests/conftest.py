@@ -10,7 +10,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-from postgres_fixtures import new_database, postgres
+from postgres_fixtures import new_database, postgres, run_as_owner
 from prepared import Prepared, prepared
 from suite_groups import (
     pytest_collection_modifyitems,
@@ -31,6 +31,7 @@ __all__ = [
     "pytest_collection_modifyitems",
     "pytest_configure_node",
     "pytest_xdist_make_scheduler",
+    "run_as_owner",
     "s3_server",
     "served",
 ]

@@ -34,12 +34,14 @@ def binaries() -> Path:
 
 
 class PostgresServer:
-    """A server on a socket in a folder of its own; as root it runs as another user, for it refuses to be root."""
+    """A server on a socket in a folder of its own, below `home`; as root it runs as another user, for it refuses to be
+    root.
+    """
 
-    def __init__(self, settings: dict[str, str] | None = None) -> None:
+    def __init__(self, settings: dict[str, str] | None = None, home: Path | None = None) -> None:
         self.bin = binaries()
         self.user = next((u for u in ("postgres", "nobody") if _is_user(u)), None) if os.geteuid() == 0 else None
-        self.folder = Path(tempfile.mkdtemp(prefix="gnd-pg-"))
+        self.folder = Path(tempfile.mkdtemp(prefix="gnd-pg-", dir=home))
         self.data = self.folder / "data"
         if self.user:
             shutil.chown(self.folder, self.user)

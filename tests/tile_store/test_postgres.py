@@ -210,7 +210,7 @@ def store_url(store: PostgresStore) -> str:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda url: url.replace("host=/tmp", "host=/nowhere"), "no server answers there"),
+        (lambda url: url.replace("host=/", "host=/nowhere/"), "no server answers there"),
         (lambda url: url.replace("/test_", "/missing_"), "no such database; createdb makes one"),
         (lambda url: url.replace("gnd@", "stranger@"), "does not know the user"),
         (lambda url: "service=nobody-has-this", "no such service"),
