@@ -175,5 +175,5 @@ def errors_picture(vehicles: Sequence[tuple[F64, F64, F64]]) -> bytes:
 
 def _png(figure: Figure) -> bytes:
     out = io.BytesIO()
-    figure.savefig(out, format="png", pil_kwargs={"optimize": True})
+    figure.savefig(out, format="png")
     return out.getvalue()

@@ -88,7 +88,7 @@ def write_png(figure: "Figure", path: Path) -> None:
     partial = path.with_name(f".{path.name}.part")
     try:
         with partial.open("wb") as file:
-            figure.savefig(file, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
+            figure.savefig(file, format="png", metadata={"Software": None})
         partial.replace(path)
     except OSError:
         partial.unlink(missing_ok=True)
