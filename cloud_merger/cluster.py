@@ -7,8 +7,6 @@ Points of different voxels have no pair, so the distance matrix is block-diagona
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 Index = NDArray[np.int64]
 NOISE = -1
@@ -43,6 +41,9 @@ def _neighbourhood_weight(weight: Index, i: Index, j: Index) -> Index:
 
 def _core_labels(core: NDArray[np.bool_], i: Index, j: Index) -> Index:
     """Connected components of the core points, numbered by their first point; NOISE elsewhere."""
+    from scipy.sparse import csr_array  # here because the import is dear, and kernels cluster in the default mode
+    from scipy.sparse.csgraph import connected_components
+
     n = len(core)
     both = core[i] & core[j]
     graph = csr_array((np.ones(int(both.sum()), bool), (i[both], j[both])), shape=(n, n))
@@ -66,6 +67,7 @@ def dbscan_sklearn(
     weight: Index, i: Index, j: Index, distance: NDArray[np.float64], *, eps: float, min_samples: int
 ) -> NDArray[np.int64]:
     """The same labels by scikit-learn: one sparse distance matrix, explicit zeros kept. Arguments as `dbscan`."""
+    from scipy.sparse import csr_array
     from sklearn.cluster import DBSCAN  # here because the import is dear and only "paper" mode needs it
 
     n = len(weight)

@@ -20,8 +20,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from gnd.cloud_merger.config import ShardConfig
-from gnd.schemas.report_states import ReportState
+from gnd.importing import without_garbage
+
+with without_garbage():
+    from gnd.cloud_merger.config import ShardConfig
+    from gnd.schemas.report_states import ReportState
 
 ENDS_IN_S: Final = 5.0
 NICER: Final = 5
@@ -127,7 +130,8 @@ def _listen(stop: threading.Event, arrived: threading.Event) -> None:
 
 def main() -> None:
     """Read the configuration, then work until the line ends."""
-    from gnd.cloud_merger.merger import run_worker
+    with without_garbage():
+        from gnd.cloud_merger.merger import run_worker
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
     with contextlib.suppress(PermissionError):  # a container or unit may forbid it: the work is done all the same

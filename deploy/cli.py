@@ -20,6 +20,7 @@ from gnd.deploy.compiling import say_progress
 from gnd.extras import explained
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.jit import tell_compiling
+from gnd.importing import without_garbage
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "fleet": ("gnd.deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map being updated."),
@@ -104,7 +105,7 @@ class LazyGroup(click.Group):
         if cmd_name not in self._table:
             return None
         module, attribute = self._table[cmd_name][0].split(":")
-        with explained(), ending_at_once():
+        with explained(), ending_at_once(), without_garbage():
             command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gnd.cloud_merger.errors import BadReport
 from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
@@ -168,5 +167,7 @@ def _near(points: Sequence[Numbered], within_m: float) -> list[tuple[Numbered, N
     """Pairs of points that are horizontally so near, in order."""
     if len(points) < 2:
         return []
+    from scipy.spatial import cKDTree  # here because the import is dear, and few shards merge features
+
     xy = np.array([found.points_m[0, :2] for _, found in points])
     return [(points[i], points[j]) for i, j in sorted(cKDTree(xy).query_pairs(within_m))]

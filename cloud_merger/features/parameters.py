@@ -4,8 +4,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
-from scipy.special import gammaincinv
-
 from gnd.cloud_merger.errors import MergerError
 from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.feature_layer import LayerParameters
@@ -68,4 +66,6 @@ class FeatureMergeParameters:
 @lru_cache
 def gate_of(dimensions: int) -> float:
     """The largest squared Mahalanobis distance of a measurement of 1, 2 or 3 dimensions that passes."""
+    from scipy.special import gammaincinv  # here because the import is dear, and few shards merge features
+
     return float(2.0 * gammaincinv(dimensions / 2.0, FEATURE_GATE))  # as scipy.stats.chi2, which loads slowly

@@ -2,6 +2,7 @@
 
 import itertools
 import signal
+from pathlib import Path
 
 import pytest
 from merger_processes import Cloud, all_acks, in_threads, raw_session, wait_for
@@ -18,10 +19,12 @@ from merger_world import (
     report_of,
     tile_of_states,
 )
+from suite_kernels import has_library
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.ownership import owner_of
 from gnd.cloud_merger.work import Worker
+from gnd.deploy.load.cpu import children
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import split
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -72,6 +75,12 @@ def test_the_test_gives_both_shards_districts():
     assert TILE.district == NEIGHBOUR.district
 
 
+def has_scipy(pid):
+    """Whether a shard or its worker has loaded scipy."""
+    (worker,) = children(pid)
+    return any("/scipy/" in Path(f"/proc/{one}/maps").read_text(encoding="utf-8") for one in (pid, worker))
+
+
 @pytest.mark.slow
 def test_every_report_has_one_ack_and_every_version_one_notice(cloud):
     cloud.start(*SHARDS)
@@ -86,6 +95,8 @@ def test_every_report_has_one_ack_and_every_version_one_notice(cloud):
     assert len(told) == len(cloud.versions()) > 0
     assert all(one == told[one.tile, one.version] for one in cloud.updates)  # a slow owner's is sent by another, too
     assert cloud.store.counts().reports == 24
+    if has_library():  # numba's compiler loads it
+        assert not any(has_scipy(cloud.shards[name].pid) for name in SHARDS)
     for name in SHARDS:
         cloud.signal(name, signal.SIGTERM)
         assert cloud.shards[name].wait(20) == 0, cloud.log(name)

@@ -48,6 +48,11 @@ def test_a_shard_loads_gtsam_when_it_maps_a_road_and_not_before() -> None:
     assert "gtsam" not in loaded_by("import gnd.cloud_merger.merger")
 
 
+def test_a_shard_loads_scipy_when_it_merges_features_and_not_before() -> None:
+    """Nor does one that clusters by kernels, as all do that do not follow the paper to the letter."""
+    assert loaded_by("import gnd.cloud_merger.cli, gnd.cloud_merger.merger").isdisjoint(HEAVY)
+
+
 def test_a_kernel_loads_numba_when_it_is_called_and_not_before() -> None:
     imports = "import numpy as np; from gnd.gnd_map.codec import decode_tiles, encode_tiles"
     assert "numba" not in loaded_by(imports)
