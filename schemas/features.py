@@ -121,7 +121,7 @@ def check_feature_bytes(data: bytes) -> None:
         TooLarge: more bytes or fields, or reports: a parser would make one large report of many.
         Malformed: the bytes are not fields.
     """
-    for count, report in enumerate(submessages("ChangeReport", data, _NUMBER), start=1):
+    for count, report in enumerate(submessages("ChangeReport", data, _NUMBER, limits.MAX_REPORT_FIELDS), start=1):
         check_length("ChangeReport", count, 1, "reports of features")
         check_length(_NAME, len(data), limits.MAX_FEATURE_REPORT_BYTES, "bytes")
         check_field_count(_NAME, report, limits.MAX_REPORT_FIELDS)

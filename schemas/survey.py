@@ -230,7 +230,7 @@ def check_survey_bytes(data: bytes) -> None:
         TooLarge: more reports, bytes or fields: a parser makes an object of every two bytes of empty submaps.
         Malformed: the bytes are not fields.
     """
-    for count, survey in enumerate(submessages("ChangeReport", data, _NUMBER), start=1):
+    for count, survey in enumerate(submessages("ChangeReport", data, _NUMBER, limits.MAX_REPORT_FIELDS), start=1):
         check_length("ChangeReport", count, 1, "surveys")
         check_length("SurveyReport", len(data), limits.MAX_SURVEY_REPORT_BYTES, "bytes")
         check_field_count("SurveyReport", survey, _MAX_FIELDS)
@@ -240,9 +240,10 @@ def is_survey(data: bytes) -> bool:
     """Whether a message holds a part of a survey; it is not read.
 
     Raises:
+        TooLarge: of more fields than a message to the cloud has.
         Malformed: the bytes are not fields.
     """
-    return any(True for _ in submessages("ChangeReport", data, _NUMBER))
+    return any(True for _ in submessages("ChangeReport", data, _NUMBER, limits.MAX_REPORT_FIELDS))
 
 
 def survey_of(message: survey_report_pb2.SurveyReport) -> SurveyReport:

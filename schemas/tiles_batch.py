@@ -329,7 +329,8 @@ def _other_reply(data: bytes) -> TilesReply | None:
     """The answer about another district: none where it is empty, and about no others of its own."""
     if not data:
         return None
-    if any(True for _ in submessages("TilesReply", data, OTHERS_FIELD)):  # before they are read, however deep
+    others = submessages("TilesReply", data, OTHERS_FIELD, limits.MAX_TILES_REPLY_FIELDS)
+    if any(True for _ in others):  # before they are read, however deep
         raise BadValue("TilesReply about another district that is itself about others")
     return TilesReply.decode(data)
 

@@ -21,22 +21,29 @@ def check_field_count(name: str, data: bytes, limit: int) -> None:
         TooLarge: more fields.
         Malformed: the bytes are not fields.
     """
-    for count, _ in enumerate(_fields(name, data), start=1):
-        if count > limit:
-            raise TooLarge(f"{name} of {len(data)} bytes has more than {limit} fields")
+    for _ in _fields(name, data, limit):
+        pass
 
 
-def submessages(name: str, data: bytes, number: int) -> Iterator[bytes]:
-    """The bytes of each submessage `number` on the top level; `Malformed` when `data` are not fields."""
-    for tag, start, end in _fields(name, data):
+def submessages(name: str, data: bytes, number: int, limit: int) -> Iterator[bytes]:
+    """The bytes of each submessage `number` on the top level, where there are at most `limit` fields.
+
+    Raises:
+        TooLarge: more fields, of any number.
+        Malformed: the bytes are not fields.
+    """
+    for tag, start, end in _fields(name, data, limit):
         if tag == number << 3 | _BYTES:
             yield data[start:end]
 
 
-def _fields(name: str, data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Tag of each field, where its content begins and ends."""
-    at = 0
+def _fields(name: str, data: bytes, limit: int) -> Iterator[tuple[int, int, int]]:
+    """Tag of each field, where its content begins and ends; `TooLarge` before the one that is too many is read."""
+    at = count = 0
     while at < len(data):
+        count += 1
+        if count > limit:
+            raise TooLarge(f"{name} of {len(data)} bytes has more than {limit} fields")
         tag, at = _varint(name, data, at)
         start, at = _skip_field(name, data, at, tag & 7)
         yield tag, start, at
