@@ -56,6 +56,10 @@ class RunFolder:
         """Which map a vehicle drove on where, see `gnd.vehicle_agent.way`."""
         return self.agents / vehicle / "way.jsonl"
 
+    def result(self, vehicle: str) -> Path:
+        """What a vehicle says of its drive when it has ended."""
+        return self.agents / vehicle / "result.json"
+
     @property
     def store(self) -> Path:
         """The tile store: every version, every report."""

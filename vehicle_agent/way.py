@@ -35,6 +35,7 @@ class Milestone:
         lat_rad, lon_rad: where.
         tile: Morton id of the tile under the wheels.
         version: of that tile, as the vehicle holds it; 0: there is none in the store, None: it is not held (yet).
+        health: of the pose; "": a way that was written before ways told it.
     """
 
     t_ns: int
@@ -44,6 +45,7 @@ class Milestone:
     lon_rad: float
     tile: int
     version: int | None
+    health: str = ""
 
 
 class Way:
@@ -80,7 +82,8 @@ class Way:
         tile_id = TileId.from_geodetic(lat_rad, lon_rad)
         tile = self._held(tile_id)
         version = None if tile is None else tile.version
-        one = Milestone(place.t_ns, time.time_ns(), place.odometer_m, lat_rad, lon_rad, tile_id.morton, version)
+        at = place.t_ns, time.time_ns(), place.odometer_m, lat_rad, lon_rad
+        one = Milestone(*at, tile_id.morton, version, place.health)
         print(json.dumps(asdict(one), separators=(",", ":")), file=self._file)
 
 

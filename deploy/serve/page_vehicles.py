@@ -1,7 +1,8 @@
 """Where the vehicles of a run are, and how they fare: from the ways that they write, and from what they say on the bus.
 
-A vehicle says where it is once a kilometre, to save bytes; the way that it writes on its own disk has a line every five
-metres. On the machine of a `gnd fleet` the page reads both.
+A vehicle says where it is once a kilometre, to save bytes; the way that it writes on its own disk has a line with place
+and health every five metres, and its result says that its drive has ended. On the machine of a `gnd fleet` the page
+reads all of them.
 """
 
 import json
@@ -22,16 +23,18 @@ MOST_VEHICLES: Final = 2_000
 _LINE_BYTES: Final = 4096
 _NS_PER_MS: Final = 1_000_000
 _LEAST_M: Final = 0.5
+_LONGEST_HEALTH: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
 class WayPoint:
-    """A vehicle at a time: POSIX ms, radians, metres driven."""
+    """A vehicle at a time: POSIX ms, radians, metres driven; its health, "" where the way does not tell it."""
 
     wall_ms: int
     lat_rad: float
     lon_rad: float
     odometer_m: float
+    health: str = ""
 
 
 class WayTail:
@@ -72,8 +75,9 @@ def _point(line: bytes) -> WayPoint | None:
             float(told["lat_rad"]),
             float(told["lon_rad"]),
             float(told["odometer_m"]),
+            str(told.get("health", ""))[:_LONGEST_HEALTH],
         )
-    except (ValueError, TypeError, KeyError, OverflowError):
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
         return None
     is_place = abs(point.lat_rad) <= math.pi / 2 and abs(point.lon_rad) <= math.pi
     return point if is_place and math.isfinite(point.odometer_m) else None
@@ -89,6 +93,7 @@ class _Vehicle:
     tiles: int = 0
     reports: int = 0
     doubts: int = 0
+    has_ended: bool = False
 
 
 class PageVehicles:
@@ -115,7 +120,8 @@ class PageVehicles:
     def on_sample(self, sample: TrafficSample, wall_ms: int) -> None:
         """Take what a vehicle says of itself."""
         with self._lock:
-            if len(self._said) >= MOST_VEHICLES and sample.vehicle not in self._said:
+            is_known = sample.vehicle in self._known or sample.vehicle in self._said
+            if not is_known and len(self._known) + len(self._said) >= MOST_VEHICLES:
                 return
             self._said[sample.vehicle] = sample
             if sample.has_position and sample.vehicle not in self._tails:
@@ -130,7 +136,9 @@ class PageVehicles:
                 for point in tail.more():
                     self._move(name, point)
                     moved.add(name)
-            for name, sample in list(self._said.items()):
+            moved |= {name for name in self._tails if self._has_just_ended(name)}
+            while self._said:
+                name, sample = self._said.popitem()
                 moved |= {name} if self._heard(name, sample) else set()
             return [self._told(name) for name in sorted(moved)]
 
@@ -150,6 +158,15 @@ class PageVehicles:
                 self._tails.setdefault(folder.name, WayTail(self._run.way(folder.name)))
         return iter(list(self._tails.items()))
 
+    def _has_just_ended(self, name: str) -> bool:
+        """Whether the end of a drive is news; an agent that drives again has not ended."""
+        one = self._known.get(name)
+        if self._run is None or one is None:
+            return False
+        was = one.has_ended
+        one.has_ended = _is_newer(self._run.result(name), self._run.way(name))
+        return one.has_ended != was
+
     def _heard(self, name: str, sample: TrafficSample) -> bool:
         one = self._known.setdefault(name, _Vehicle([]))
         now = sample.health, sample.tiles, sample.reports, sample.tiles_doubtful
@@ -164,7 +181,7 @@ class PageVehicles:
         east_m, north_m = self._place(point.lat_rad, point.lon_rad)
         if point.odometer_m < one.odometer_m - 1.0 and name in self._tails:  # a restarted agent drives anew
             one.points.clear()
-        one.odometer_m = point.odometer_m
+        one.odometer_m, one.health = point.odometer_m, point.health or one.health
         if one.points:
             _, east, north, _ = one.points[-1]
             if math.hypot(east_m - east, north_m - north) >= _LEAST_M:
@@ -181,10 +198,18 @@ class PageVehicles:
             "heading_rad": one.heading_rad,
             "odometer_m": round(one.odometer_m, 1),
             "health": one.health,
+            "ended": one.has_ended,
             "tiles": one.tiles,
             "reports": one.reports,
             "doubts": one.doubts,
         }
+
+
+def _is_newer(one: Path, other: Path) -> bool:
+    try:
+        return one.stat().st_mtime_ns >= other.stat().st_mtime_ns
+    except OSError:
+        return False
 
 
 def run_is_going(folder: RunFolder) -> bool:

@@ -36,7 +36,7 @@ def test_a_milestone_names_the_version_under_the_wheels_every_few_metres(tmp_pat
     drive(path, local_map, 0.0, 4.0, 5.5, 9.0)  # another life of the agent
     found = list(read_way(path))
     assert [(one.odometer_m, one.version) for one in found][-2:] == [(0.0, 7), (5.5, 7)]
-    assert {one.tile for one in found} == {here.morton}
+    assert {(one.tile, one.health) for one in found} == {(here.morton, "lost")}
     local_map.set_absent(here)
     drive(path, local_map, 6.0, 12.0)
     assert [one.version for one in read_way(path)][-2:] == [0, 0]

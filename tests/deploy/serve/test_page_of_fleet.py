@@ -48,7 +48,9 @@ def test_the_page_follows_a_run_dies_alone_and_the_run_is_served_after_it(start_
     with served(run.folder) as page:
         about = page.value("/api/map")
         assert (about["live"], about["changed_tiles"] > 0) == (False, True)
-        assert {one["name"] for one in page.value("/api/vehicles")} == {"vehicle-00", "vehicle-01"}
+        vehicles = page.value("/api/vehicles")
+        assert {(one["name"], one["ended"]) for one in vehicles} == {("vehicle-00", True), ("vehicle-01", True)}
+        assert {one["health"] for one in vehicles} <= {"good", "degraded"}
         ways = page.value("/api/ways")
         assert all(len(way) > 3 for way in ways.values())
         traffic = page.value("/api/traffic")
