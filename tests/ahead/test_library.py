@@ -290,6 +290,16 @@ def test_without_a_compiler_nothing_is_written_and_one_line_says_so(folder: Path
         assert not out.exists()
 
 
+def test_a_compiler_without_headers_is_told_before_anything_is_compiled(folder: Path, tmp_path: Path) -> None:
+    for variable, words in (("CC", "cc -nostdinc"), ("CXX", "c++ -nostdinc")):
+        out = tmp_path / "k.so"
+        done = run(folder, "-m", "gnd.deploy.cli", "kernels", "build", "--out", str(out), **{variable: words})
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.startswith(f"gnd: no library of kernels was built: {words} builds no extension of Python: ")
+        assert done.stderr.count("\n") == 1
+        assert not out.exists()
+
+
 @pytest.mark.slow
 def test_every_kernel_in_a_library_here_agrees_with_numba_to_the_bit() -> None:
     """The one that the suite's programs run, or else that of this installation."""

@@ -33,6 +33,7 @@ V3: Final = "x86-64-v3"
 _OF_V3: Final = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
 _ANY: Final = {"x86_64": "x86-64"}
 _ENVIRONMENT: Final = "_ZN08NumbaEnv"
+_EMPTY: Final = "#include <Python.h>\nPyObject *nothing(void) { return NULL; }\n"
 _C_FLAGS: Final = ("-O2", "-fPIC", "-fvisibility=hidden", "-w")
 
 
@@ -65,7 +66,7 @@ def build(path: Path, scenes: Sequence[str] = SCENES) -> dict[str, Any]:
     Raises:
         CannotBuild: no C compiler, or it refuses; nothing is written then.
     """
-    compilers()
+    _try_compilers()
     called = recorded(scenes)
     entries, left_out = [], {}
     for kernel, types in called:
@@ -246,6 +247,26 @@ def _table(entries: Sequence[Entry], manifest: dict[str, Any]) -> Iterator[str]:
     text = json.dumps(manifest, separators=(",", ":")).encode()
     yield f"static const unsigned char description[] = {{{_bytes(text)}}};"
     yield f"#define DESCRIPTION_BYTES {len(text)}"
+
+
+def _try_compilers() -> None:
+    """Compile and link an empty extension: before minutes of work, not after them.
+
+    Raises:
+        CannotBuild: no compiler, no headers of Python, or no libraries to link with.
+    """
+    cc, cxx = compilers()
+    with tempfile.TemporaryDirectory(prefix="gnd-kernels-") as folder:
+        for compiler, name in ((cxx, "empty.cpp"), (cc, "empty.c")):
+            source = Path(folder) / name
+            source.write_text(_EMPTY, encoding="ascii")
+            include = f"-I{sysconfig.get_path('include')}"
+            command = [*compiler, "-shared", "-fPIC", include, str(source), "-o", str(source.with_suffix(".so"))]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - on own files
+            if done.returncode:
+                said = [line for line in done.stderr.splitlines() if "error" in line or "cannot" in line]
+                told = (said or done.stderr.splitlines() or [f"ended with {done.returncode}"])[0]
+                raise CannotBuild(f"{shlex.join(compiler)} builds no extension of Python: {told.strip()}")
 
 
 def _bytes(data: bytes) -> str:
