@@ -16,10 +16,10 @@ args = parser.parse_args()
 with gnd.Map(args.map) as opened:
     if args.tile is None:
         found = opened.diff(args.since, layer=args.layer)
-        print(f"+{found.added} -{found.removed} ~{found.changed} {found.noun} in {len(found.tiles)} tiles")
+        print(f"+{found.new} -{found.deleted} ~{found.modified} {found.noun} in {len(found.tiles)} tiles")
     else:
         versions = opened.history(args.tile, layer=args.layer)
         for old, new in pairwise(versions):
             found = opened.diff(old.version, new.version, tile=args.tile, layer=args.layer)
             when = datetime.fromtimestamp(new.created_ns * 1e-9, UTC)
-            print(f"v{new.version} {when:%Y-%m-%d %H:%M} +{found.added} -{found.removed} ~{found.changed} {found.noun}")
+            print(f"v{new.version} {when:%Y-%m-%d %H:%M} +{found.new} -{found.deleted} ~{found.modified} {found.noun}")

@@ -172,11 +172,11 @@ class TileDiff:
     """Path."""
     old_version: int
     new_version: int
-    added: int
+    new: int
     """Only in the new state."""
-    removed: int
+    deleted: int
     """Only in the old state."""
-    changed: int
+    modified: int
     """In both, another one."""
     same: int
     max_shift_m: float
@@ -192,9 +192,9 @@ class MapDiff:
     tiles: tuple[TileDiff, ...]
     """Those that differ, in the order of their ids."""
     tiles_same: int
-    added: int
-    removed: int
-    changed: int
+    new: int
+    deleted: int
+    modified: int
     same: int
 
     def as_dict(self) -> dict[str, Any]:
@@ -261,7 +261,7 @@ def tile_diff(tile: TileId, old: StoredTile | None, new: StoredTile | None, laye
     if is_feature_layer(layer):
         counts = feature_tile_diff(tile, old, new)
         return TileDiff(
-            tile.path, *numbers, counts.added, counts.removed, counts.changed, counts.same, counts.max_shift_m
+            tile.path, *numbers, counts.new, counts.deleted, counts.modified, counts.same, counts.max_shift_m
         )
     before, after = _gaussians(old), _gaussians(new)
     delta = diff(before, after)
@@ -271,9 +271,9 @@ def tile_diff(tile: TileId, old: StoredTile | None, new: StoredTile | None, laye
         tile=tile.path,
         old_version=numbers[0],
         new_version=numbers[1],
-        added=len(delta.put) - len(changed),
-        removed=len(delta.removed),
-        changed=len(changed),
+        new=len(delta.put) - len(changed),
+        deleted=len(delta.removed),
+        modified=len(changed),
         same=len(after) - len(delta.put),
         max_shift_m=float(np.linalg.norm(shift_m, axis=1).max(initial=0.0)),
     )
@@ -284,15 +284,15 @@ def _gaussians(stored: StoredTile | None) -> Gaussians:
 
 
 def _map_diff(layer: str, prefix: str, diffs: list[TileDiff]) -> MapDiff:
-    different = tuple(d for d in diffs if d.added or d.removed or d.changed)
+    different = tuple(d for d in diffs if d.new or d.deleted or d.modified)
     return MapDiff(
         layer=layer,
         prefix=prefix,
         tiles=different,
         tiles_same=len(diffs) - len(different),
-        added=sum(d.added for d in diffs),
-        removed=sum(d.removed for d in diffs),
-        changed=sum(d.changed for d in diffs),
+        new=sum(d.new for d in diffs),
+        deleted=sum(d.deleted for d in diffs),
+        modified=sum(d.modified for d in diffs),
         same=sum(d.same for d in diffs),
     )
 

@@ -96,9 +96,9 @@ def _heights_m(pieces: list[Feature]) -> tuple[int, int]:
 class FeatureTileDiff:
     """How many pieces of one tile differ between two states, and how far the farthest has moved."""
 
-    added: int
-    removed: int
-    changed: int
+    new: int
+    deleted: int
+    modified: int
     same: int
     max_shift_m: float
 
@@ -110,9 +110,9 @@ def feature_tile_diff(tile: TileId, old: StoredTile | None, new: StoredTile | No
     held = {feature.key: feature for feature in before.features}
     changed = [(held[feature.key], feature) for feature in delta.put if feature.key in held]
     return FeatureTileDiff(
-        added=len(delta.put) - len(changed),
-        removed=len(delta.removed),
-        changed=len(changed),
+        new=len(delta.put) - len(changed),
+        deleted=len(delta.removed),
+        modified=len(changed),
         same=len(after.features) - len(delta.put),
         max_shift_m=max((_shift_m(*pair) for pair in changed), default=0.0),
     )

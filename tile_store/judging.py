@@ -60,7 +60,7 @@ class MapChange:
 
     Attributes:
         layer: of Gaussians.
-        what: became of them: "new", "gone", "changed".
+        what: became of them: "new", "deleted", "modified".
         tiles: by number, each once.
     """
 

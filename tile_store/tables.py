@@ -103,8 +103,8 @@ def print_diff(console: Console, result: MapDiff) -> None:
     if rows:
         console.print(table)
     console.print(
-        f"{len(rows)} tiles differ, {result.tiles_same} are the same; {result.noun}: {result.added} added,"
-        f" {result.removed} removed, {result.changed} changed, {result.same} the same",
+        f"{len(rows)} tiles differ, {result.tiles_same} are the same; {result.noun}: {result.new} new,"
+        f" {result.deleted} deleted, {result.modified} modified, {result.same} the same",
         highlight=False,
     )
 

@@ -1,8 +1,8 @@
 """What differs between two states of a map as objects: a work list for a mapping team.
 
-Voxels that are new, gone or of another shape are clustered apart from each other (DBSCAN, Ester et al. 1996: 26
-neighbours, at least two voxels). Where vehicles reported them, the store says which reports made each voxel what it is;
-a report's id holds the time of its drive.
+Voxels that are new, deleted or modified (of another shape) are clustered apart from each other (DBSCAN, Ester et al.
+1996: 26 neighbours, at least two voxels), and what is longer than somebody sees at one look is cut. Where vehicles
+reported them, the store says which reports made each voxel what it is; a report's id holds the time of its drive.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +14,7 @@ import numpy as np
 from ulid import ULID
 
 from gnd.deploy.map_export.libraries import library
+from gnd.deploy.map_export.pieces import pieces
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.gaussian import Gaussians
@@ -27,7 +28,7 @@ from gnd.tile_store.judging import ChangedTile
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import StoredTile
 
-What = Literal["new", "gone", "changed"]
+What = Literal["new", "deleted", "modified"]
 Shape = Literal["surface", "pole", "wall", "object"]
 
 NEIGHBOUR_M: Final = 1.8 * VOXEL_M
@@ -45,7 +46,7 @@ _MS: Final = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One object-like cluster of changed voxels.
+    """One object-like cluster of changed voxels, or a piece of a long one.
 
     Attributes:
         change: what became of it.
@@ -173,11 +174,11 @@ def changes_of_tiles(
     Raises:
         MissingExtra: scikit-learn is not installed.
     """
-    held = list(pairs)
+    held = sorted(pairs, key=lambda one: one[0].morton)
     if not held:
         return ChangedVoxels((), 0)
     frame = LocalFrame.of_tile(held[len(held) // 2][0])
-    voxels: dict[What, list[_VoxelTable]] = {"new": [], "gone": [], "changed": []}
+    voxels: dict[What, list[_VoxelTable]] = {"new": [], "deleted": [], "modified": []}
     reporters = _Reporters(store, layer)
     for one, before, after in held:
         since = before.version if before and same_store else 0
@@ -216,7 +217,7 @@ class _Reporters:
 def _changed(
     tile: TileId, before: StoredTile | None, after: StoredTile | None, frame: LocalFrame, source: Any
 ) -> Iterator[tuple[What, _VoxelTable]]:
-    """The voxels of a tile that are new, gone, or of another shape."""
+    """The voxels of a tile that are new, deleted, or of another shape."""
     a = before.decode_gaussians().gaussians if before else Gaussians.empty()
     b = after.decode_gaussians().gaussians if after else Gaussians.empty()
     delta = diff(a, b)
@@ -230,8 +231,8 @@ def _changed(
     where = source()
     parts: tuple[tuple[What, Gaussians], ...] = (
         ("new", delta.put.take(is_new)),
-        ("gone", a.select(delta.removed)),
-        ("changed", both.take(alike < ALIKE)),
+        ("deleted", a.select(delta.removed)),
+        ("modified", both.take(alike < ALIKE)),
     )
     T = frame.T_self_other(LocalFrame.of_tile(tile))
     for what, g in parts:
@@ -243,7 +244,7 @@ def _changed(
 
 
 def _clusters(what: What, found: Sequence[_VoxelTable], frame: LocalFrame) -> Iterator[Change | int]:
-    """The clusters of one kind; then how many voxels lie alone."""
+    """The clusters of one kind, or their pieces, and how many voxels lie alone."""
     if not found:
         return
     centre_m = np.concatenate(
@@ -254,7 +255,10 @@ def _clusters(what: What, found: Sequence[_VoxelTable], frame: LocalFrame) -> It
     row = np.concatenate([np.arange(len(one.voxel_id)) for one in found])
     for label in range(int(cluster.max()) + 1):
         chosen = np.flatnonzero(cluster == label)
-        yield _change(what, [(found[part[i]], int(row[i])) for i in chosen], frame)
+        T = LocalFrame.of_tile(found[part[chosen[0]]].tile).T_self_other(frame)  # its own, whatever else has changed
+        for piece in pieces(centre_m[chosen] @ T[:2, :3].T + T[:2, 3]):
+            voxels = [(found[part[i]], int(row[i])) for i in chosen[piece]]
+            yield _change(what, voxels, frame) if len(voxels) >= LEAST_VOXELS else len(voxels)
     yield int((cluster < 0).sum())
 
 

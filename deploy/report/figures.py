@@ -171,4 +171,4 @@ def _number(value: Any) -> float:
 
 def classes_in_words() -> Sequence[str]:
     """What the colours of the pictures mean."""
-    return ("grey: as before", "vermilion: new", "yellow: modified", "blue: gone")
+    return ("grey: as before", "vermilion: new", "yellow: modified", "blue: deleted")

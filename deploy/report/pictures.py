@@ -36,7 +36,7 @@ class MapStates:
 
     Attributes:
         frame: of all three.
-        before: base map; what is gone or modified in the newest one has the class of that.
+        before: base map; what is deleted or modified in the newest one has the class of that.
         after: newest map with what the run has changed.
         truth: of the simulated world, None without.
     """

@@ -6,11 +6,12 @@ from typing import Final
 
 from gnd.deploy.html_page import picture, text_table
 from gnd.deploy.map_export.changes import Change, ChangedVoxels
+from gnd.deploy.map_export.pieces import LONGEST_M
 from gnd.deploy.report.finished_run import FinishedRun
 from gnd.deploy.report.pictures import MapStates, change_picture
 
 _MOST_ROWS: Final = 500
-_WORDS: Final = {"new": "new", "gone": "gone", "changed": "another shape"}
+_KINDS: Final = ("new", "deleted", "modified")
 
 
 def work_list(run: FinishedRun, states: MapStates | None, pictures: int) -> str:
@@ -31,13 +32,13 @@ def work_list(run: FinishedRun, states: MapStates | None, pictures: int) -> str:
 
 
 def _said(found: ChangedVoxels, pictures: int) -> str:
-    counts = {what: sum(one.change == what for one in found.changes) for what in _WORDS}
-    told = ", ".join(f"{count} {_WORDS[what]}" for what, count in counts.items() if count)
+    counts = {what: sum(one.change == what for one in found.changes) for what in _KINDS}
+    told = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
     noun = "1 change" if len(found.changes) == 1 else f"{len(found.changes)} changes"
     which = "each with a picture" if pictures == len(found.changes) else f"the {pictures} largest with a picture"
     return (
-        f"{noun} ({told}), {which}. Voxels that touch are one change; what is new, gone and of "
-        f"another shape is told apart. {_alone(found)}"
+        f"{noun} ({told}), {which}. Voxels that touch are one change, cut where it is longer than {LONGEST_M:.0f} m; "
+        f"what is new, deleted and modified (of another shape) is told apart. {_alone(found)}"
     )
 
 
@@ -46,7 +47,7 @@ def _alone(found: ChangedVoxels) -> str:
 
 
 def _card(number: int, change: Change, states: MapStates) -> str:
-    head = f"{number}. {_WORDS[change.change]}: {change.shape}, {_size(change)}, {change.voxels} voxels"
+    head = f"{number}. {change.change}: {change.shape}, {_size(change)}, {change.voxels} voxels"
     return (
         f'<article class="change"><h3 id="change-{number}">{head}</h3><p class="note">{escape(_where(change))}. '
         f"{escape(_who(change))}</p>{picture(change_picture(change, states), f'Change {number} before and after')}"
@@ -83,7 +84,7 @@ def _table(found: ChangedVoxels) -> str:
         "voxels",
         "vehicles",
         "by two or more",
-        "last seen",
+        "last seen (drive's clock)",
     )
     named = "All changes" if len(rows) == len(found.changes) else f"The {len(rows)} largest of {len(found.changes)}"
     return f"<details><summary>{named} in figures</summary>{text_table(header, rows, left=3)}</details>"
@@ -93,7 +94,7 @@ def _rows(found: ChangedVoxels) -> Iterator[tuple[str, ...]]:
     for number, one in enumerate(found.changes[:_MOST_ROWS], 1):
         yield (
             str(number),
-            _WORDS[one.change],
+            one.change,
             one.shape,
             f"{one.lat_deg:.7f}",
             f"{one.lon_deg:.7f}",

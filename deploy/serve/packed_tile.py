@@ -11,7 +11,7 @@
         u16[4N]   standard deviations along the axes, longest first, in 0.1 mm; then points, at most 65535
         u16[N]    how many reports say so; 0 = it comes from a survey
         u16[N]    occupied cells of 10 cm
-        u8[N]     0 as in the survey, 1 new since, 2 changed since
+        u8[N]     0 as in the survey, 1 new since, 2 modified since
 
 It is the same for ever: a version is never changed.
 """

@@ -46,7 +46,7 @@ def voxel_story(store: Store, layer: str, tile: TileId, voxel: int, version: int
 
     Returns:
         `gaussian` (None: there is none), and `steps`, oldest first: version, time, what happened to the voxel (base,
-        new, changed, removed), who merged it, and the reports that say so, with vehicle, time, class and rays.
+        new, modified, deleted), who merged it, and the reports that say so, with vehicle, time, class and rays.
 
     Raises:
         UnknownVersion: no such version.
@@ -95,7 +95,7 @@ def _steps(store: Store, layer: str, tile: TileId, voxel: int, newest: int) -> I
         now = stored.decode_gaussians().gaussians.select([voxel])
         delta = diff(before, now)
         if len(delta.removed) or len(delta.put) or is_first:
-            what = "removed" if len(delta.removed) else "changed" if len(before) else "new" if len(now) else "empty"
+            what = "deleted" if len(delta.removed) else "modified" if len(before) else "new" if len(now) else "empty"
             reports = store.voxel_provenance(layer, tile, line.version).get(voxel, ())
             yield _StoryStep(stored, "surveyed" if line.kind == "base" and len(now) else what, reports)
         before, is_first = now, False

@@ -34,6 +34,8 @@ export interface Vehicle {
   heading_rad: number | null;
   odometer_m: number;
   health: string;
+  /** Its drive has. */
+  ended: boolean;
   tiles: number;
   reports: number;
   doubts: number;
@@ -42,6 +44,7 @@ export interface Vehicle {
 export interface Report {
   id: string;
   vehicle: string | null;
+  /** By the clock of the drive, which a simulated or recorded one brings along. */
   driven_ms: number;
   says: string | null;
   rays: Record<string, number> | null;
@@ -60,7 +63,7 @@ export interface Story {
 }
 
 export interface Change {
-  change: "new" | "gone" | "changed";
+  change: "new" | "deleted" | "modified";
   shape: string;
   at_m: [number, number, number];
   length_m: number;

@@ -24,7 +24,7 @@ export function rgb(hex: string): RGB {
 }
 
 const RAMP: RGB[] = palette.ramp.map(rgb);
-const CHANGE = { surveyed: rgb(palette.change.surveyed), new: rgb(palette.change.new), changed: rgb(palette.change.changed) };
+const CHANGE = { surveyed: rgb(palette.change.surveyed), new: rgb(palette.change.new), modified: rgb(palette.change.modified) };
 const SURFACE = {
   ground: rgb(palette.surface.ground),
   upright: rgb(palette.surface.upright),
@@ -71,7 +71,7 @@ export function colourOf(p: Packed, i: number, up_m: number, shades: Shades): RG
       return ramp(evidenceShare(p.shape[4 * i + 3], p.reports[i]));
     case "change":
       if (p.kind[i] === SURVEYED || p.since[i] <= shades.from_s) return CHANGE.surveyed;
-      return p.kind[i] === NEW ? CHANGE.new : CHANGE.changed;
+      return p.kind[i] === NEW ? CHANGE.new : CHANGE.modified;
   }
 }
 
@@ -102,7 +102,7 @@ export function legend(shades: Shades): Legend {
     case "change":
       return {
         title: "Change since the survey",
-        classes: [[c.surveyed, "as surveyed"], [c.new, "new"], [c.changed, "changed"], [c.removed, "removed (ghost)"]],
+        classes: [[c.surveyed, "as surveyed"], [c.new, "new"], [c.modified, "modified"], [c.deleted, "deleted (ghost)"]],
         ends: null,
       };
   }

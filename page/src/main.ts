@@ -498,7 +498,7 @@ class Page {
       holder.append(make("label", {}, box, make("span", {}, word)));
     };
     add("Vehicles", true, (isOn) => (this.vehicles.isShown = isOn));
-    add("Removed voxels as ghosts", true, (isOn) => (this.tiles.showGhosts = isOn));
+    add("Deleted voxels as ghosts", true, (isOn) => (this.tiles.showGhosts = isOn));
     add("Ground plan of all tiles", true, (isOn) => (this.overview.group.visible = isOn));
     for (const layer of this.about.feature_layers) {
       const show = (isOn: boolean) => void this.guarded(`The layer ${layer} could not be read`, this.features.show(layer, isOn).then(() => this.view.redraw()));

@@ -4,7 +4,7 @@ import type { Story, Vehicle } from "./api";
 import { palette } from "./colours";
 import { bytes, facts, make, many, span, swatch, when } from "./dom";
 
-const WHAT: Record<string, string> = { surveyed: "surveyed", new: "new", changed: "changed", removed: "removed", empty: "nothing here" };
+const WHAT: Record<string, string> = { surveyed: "surveyed", new: "new", modified: "modified", deleted: "deleted", empty: "nothing here" };
 
 export function voxelPanel(story: Story): Node[] {
   const g = story.gaussian;
@@ -29,7 +29,7 @@ export function voxelPanel(story: Story): Node[] {
         {},
         make("strong", {}, one.vehicle ?? "unknown vehicle"),
         one.says ? ` says ${one.says}` : "",
-        make("div", { class: "soft num" }, `driven ${when(one.driven_ms)}`),
+        make("div", { class: "soft num" }, `driven ${when(one.driven_ms)}, by the drive's clock`),
         one.rays && raysOf(one.rays) && make("div", { class: "soft num" }, `rays: ${raysOf(one.rays)}`),
       ),
     );
@@ -37,7 +37,7 @@ export function voxelPanel(story: Story): Node[] {
       "section",
       { class: "step" },
       make("h3", {}, make("span", {}, `Version ${step.version}: ${WHAT[step.what] ?? step.what}`)),
-      make("div", { class: "soft num" }, `${when(step.created_ms)}${step.merger ? `, by ${step.merger}` : ""}`),
+      make("div", { class: "soft num" }, `published ${when(step.created_ms)}${step.merger ? `, by ${step.merger}` : ""}`),
       reports.length ? make("ul", {}, ...reports) : make("div", { class: "soft" }, step.kind === "base" ? "from a survey" : "no report names this voxel"),
     );
   });
@@ -56,7 +56,6 @@ export function fleetItems(vehicles: Vehicle[], go: (one: Vehicle) => void): HTM
   if (!vehicles.length) return make("p", { class: "empty" }, "No vehicle has been seen. Those of a run appear when they have driven a few metres.");
   const list = make("ul", { class: "items" });
   for (const one of vehicles) {
-    const health = one.health || "not told yet";
     const button = make(
       "button",
       { type: "button", class: "item" },
@@ -64,7 +63,7 @@ export function fleetItems(vehicles: Vehicle[], go: (one: Vehicle) => void): HTM
       make(
         "span",
         { class: "soft num" },
-        `health ${health}; ${(one.odometer_m / 1000).toFixed(2)} km driven` +
+        `${healthOf(one)}; ${(one.odometer_m / 1000).toFixed(2)} km driven` +
           (one.tiles ? `; ${many(one.tiles, "tile")}, ${many(one.reports, "report")}` : "") +
           (one.doubts ? `; ${many(one.doubts, "tile")} in doubt` : ""),
       ),
@@ -73,6 +72,11 @@ export function fleetItems(vehicles: Vehicle[], go: (one: Vehicle) => void): HTM
     list.append(make("li", {}, button));
   }
   return list;
+}
+
+function healthOf(one: Vehicle): string {
+  if (!one.health) return one.ended ? "ended" : "health not told yet";
+  return one.ended ? `ended; its last health: ${one.health}` : `health ${one.health}`;
 }
 
 export function trafficPanel(told: any): Node[] {

@@ -126,7 +126,7 @@ function drawableOf(part: Part, isBefore: boolean, middle: THREE.Vector3, reach:
   const only = new Set(other ? missing(shown, other) : rows);
   const changed = new Set(isBefore || !other ? [] : renewed(other, shown).filter((row) => !only.has(row)));
   const c = palette.change;
-  const [still, apart, otherwise] = [c.surveyed, isBefore ? c.removed : c.new, c.changed].map(rgb);
+  const [still, apart, otherwise] = [c.surveyed, isBefore ? c.deleted : c.new, c.modified].map(rgb);
   const drawable = new Drawable(subset(shown, rows));
   drawable.paint((row) => (only.has(rows[row]) ? apart : changed.has(rows[row]) ? otherwise : still));
   return drawable;

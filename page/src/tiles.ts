@@ -231,7 +231,7 @@ export class Tiles {
     }
   }
 
-  /** What was removed since the time before stays to be seen, as long as changes are shown. */
+  /** What was deleted since the time before stays to be seen, as long as changes are shown. */
   private arrangeGhost(tile: Tile, now_s: number): void {
     if (tile.ghost && tile.ghost.until_s !== Infinity) {
       if (now_s < tile.ghost.until_s) return;
@@ -255,9 +255,8 @@ export class Tiles {
   }
 
   private makeGhost(tile: Tile, old: Packed, now: Packed, of: string, until_s: number): void {
-    const gone = subset(old, missing(old, now));
-    const drawable = new Drawable(gone);
-    const colour = rgb(palette.change.removed);
+    const drawable = new Drawable(subset(old, missing(old, now)));
+    const colour = rgb(palette.change.deleted);
     drawable.paint(() => colour);
     const mesh = meshOf(drawable.discs, this.looks.ghost);
     mesh.matrix.copy(tile.matrix);

@@ -5,9 +5,9 @@ import { palette } from "./colours";
 import { byId, make, many, swatch, when } from "./dom";
 import { HIGH, type Pictures, WIDE } from "./pictures";
 
-const COLOURS: Record<string, string> = { new: palette.change.new, gone: palette.change.removed, changed: palette.change.changed };
-const WORDS: Record<string, string> = { new: "New", gone: "Gone", changed: "Changed" };
-const FILTERS = [["open", "Open"], ["new", "New"], ["gone", "Gone"], ["changed", "Changed"], ["accepted", "Accepted"]];
+const COLOURS: Record<string, string> = { new: palette.change.new, deleted: palette.change.deleted, modified: palette.change.modified };
+const WORDS: Record<string, string> = { new: "New", deleted: "Deleted", modified: "Modified" };
+const FILTERS = [["open", "Open"], ["new", "New"], ["deleted", "Deleted"], ["modified", "Modified"], ["accepted", "Accepted"]];
 
 interface Judgement {
   name: string;

@@ -112,8 +112,8 @@ def test_the_list_holds_the_changes_of_the_map(finished_run: Path) -> None:
     assert run.changes is not None
     assert run.changes.changes
     listed = sum(one.voxels for one in run.changes.changes) + run.changes.alone
-    new_or_gone = sum(one.voxels for one in run.changes.changes if one.change != "changed")
-    assert 0 < new_or_gone <= listed <= sum(one.changed_voxels() for one in run.tiles)
+    new_or_deleted = sum(one.voxels for one in run.changes.changes if one.change != "modified")
+    assert 0 < new_or_deleted <= listed <= sum(one.changed_voxels() for one in run.tiles)
     assert all(one.vehicles in (1, 2) and one.reports > 0 for one in run.changes.changes)
     text = report_page(run, pictures=0)
     table = text[text.index("All changes in figures") :]

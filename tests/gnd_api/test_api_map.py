@@ -131,17 +131,17 @@ def test_features_and_where_they_are(opened: gnd.Map) -> None:
 
 def test_differences_by_version_and_by_time(opened: gnd.Map) -> None:
     of_versions = opened.diff(1, 2, tile=HERE)
-    assert (of_versions.added, of_versions.removed, of_versions.changed, of_versions.same) == (1, 1, 0, 2)
+    assert (of_versions.new, of_versions.deleted, of_versions.modified, of_versions.same) == (1, 1, 0, 2)
     to_newest = opened.diff(2, tile=HERE)
-    assert (to_newest.added, to_newest.removed, to_newest.same) == (0, 2, 1)
+    assert (to_newest.new, to_newest.deleted, to_newest.same) == (0, 2, 1)
     of_times = opened.diff("1970-01-01T00:02:00Z", region="13033/**")
-    assert (of_times.added, of_times.removed, of_times.same, of_times.tiles_same) == (1, 3, 1, 1)
+    assert (of_times.new, of_times.deleted, of_times.same, of_times.tiles_same) == (1, 3, 1, 1)
     assert opened.diff(150 * SECOND_NS, region=EAST).tiles == ()
     lat_rad, lon_rad = EAST.centre_rad
     near = gnd.Region.circle(float(np.degrees(lat_rad)), float(np.degrees(lon_rad)), 5.0)
     assert near.tiles == {EAST}
-    assert opened.diff(150 * SECOND_NS, region=near).removed == 0
-    assert opened.diff(1, 2, tile=HERE, layer="signs").added == 2
+    assert opened.diff(150 * SECOND_NS, region=near).deleted == 0
+    assert opened.diff(1, 2, tile=HERE, layer="signs").new == 2
     with pytest.raises(gnd.GndError, match="no version 9"):
         opened.diff(1, 9, tile=HERE)
     with pytest.raises(gnd.GndError, match="is no version of a tile"):
@@ -156,7 +156,7 @@ warm_up(); gnd.Map  # all modules, while the interpreter may be read
 if os.getuid() == 0: os.setgroups([]); os.setgid(65534); os.setuid(65534)
 assert not os.access(os.path.dirname(sys.argv[1]), os.W_OK)
 with gnd.Map(sys.argv[1]) as opened:
-    print(opened.layers, len(opened.gaussians("13033/**")), opened.diff(1, 2, tile="13033/03021/23031/22102").added)
+    print(opened.layers, len(opened.gaussians("13033/**")), opened.diff(1, 2, tile="13033/03021/23031/22102").new)
 """
 
 

@@ -98,7 +98,7 @@ MAP = """
 import gnd
 with gnd.Map(sys.argv[1]) as opened:
     found = opened.gaussians("13033/**")
-    print(opened.layers, len(found), len(opened.features(layer="signs")), opened.diff(1, 2, tile=sys.argv[2]).added)
+    print(opened.layers, len(found), len(opened.features(layer="signs")), opened.diff(1, 2, tile=sys.argv[2]).new)
 """
 
 

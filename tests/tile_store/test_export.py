@@ -196,11 +196,11 @@ def test_the_difference_of_two_maps_is_what_was_changed(store: Store, tmp_path: 
     other.put_tiles([tile_of_voxels(FAR, 1)])
     found = map_diff(store, other)
     other.close()
-    assert (found.added, found.removed, found.changed, found.same, found.tiles_same) == (3, 1, 1, 3, 1)
+    assert (found.new, found.deleted, found.modified, found.same, found.tiles_same) == (3, 1, 1, 3, 1)
     far, near = sorted(found.tiles, key=lambda tile: tile.old_version)
-    assert (near.tile, near.added, near.removed, near.changed, near.same) == (TILE.path, 2, 1, 1, 1)
+    assert (near.tile, near.new, near.deleted, near.modified, near.same) == (TILE.path, 2, 1, 1, 1)
     assert near.max_shift_m == pytest.approx(0.25, abs=1e-6)
-    assert (far.tile, far.old_version, far.new_version, far.added) == (FAR.path, 0, 1, 1)
+    assert (far.tile, far.old_version, far.new_version, far.new) == (FAR.path, 0, 1, 1)
     assert json.loads(json.dumps(found.as_dict()))["tiles"][0]["tile"] in (TILE.path, FAR.path)
     head, *rows = found.rows()
     assert head[:3] == ("tile", "old_version", "new_version")
@@ -218,14 +218,14 @@ def test_two_times_of_one_store_differ_by_what_came_between(store: Store, clock:
     clock.advance(10)
     store.put_tiles([tile_of_voxels(EAST, 5), tile_of_voxels(FAR, 1, 2)])
     found = map_diff(store, store, old_at_ns=before)
-    assert (found.added, found.removed, found.changed, found.tiles_same) == (2, 1, 0, 1)
+    assert (found.new, found.deleted, found.modified, found.tiles_same) == (2, 1, 0, 1)
     assert map_diff(store, store, old_at_ns=before, new_at_ns=before).tiles == ()
-    assert map_diff(store, store, old_at_ns=before, prefix="13033").added == 0
+    assert map_diff(store, store, old_at_ns=before, prefix="13033").new == 0
 
 
 def test_two_versions_of_a_tile_differ_or_are_not_there(store: Store) -> None:
     store.put_tiles([tile_of_voxels(EAST, 5, 9, 10)])
     (found,) = version_diff(store, "ndt", EAST, 1, 2).tiles
-    assert (found.added, found.removed, found.old_version, found.new_version) == (2, 1, 1, 2)
+    assert (found.new, found.deleted, found.old_version, found.new_version) == (2, 1, 1, 2)
     with pytest.raises(UnknownVersion, match=r"tile 13033/03021/23031/22103 of layer 'ndt' has no version 9"):
         version_diff(store, "ndt", EAST, 1, 9)

@@ -259,11 +259,11 @@ def test_differences_of_feature_layers_are_counted_in_features(store: SqliteStor
     put(store, tile(TILE, sign(1), sign(2), sign(3), lane(7)), tile(EAST, sign(8)))
     put(store, tile(TILE, sign(2), sign(3, x_m=4.0), sign(4), lane(7, bend_m=0.5)))
     (one,) = version_diff(store, "signs", TILE, 1, 2).tiles
-    assert (one.added, one.removed, one.changed, one.same, one.max_shift_m) == (1, 1, 2, 1, 3.0)
+    assert (one.new, one.deleted, one.modified, one.same, one.max_shift_m) == (1, 1, 2, 1, 3.0)
     with SqliteStore(tmp_path / "other.db", EAGER) as other:
         put(other, tile(TILE, sign(2)))
         found = map_diff(other, store, layer="signs")
-        assert [(t.old_version, t.new_version, t.added, t.same) for t in found.tiles] == [(1, 2, 3, 1), (0, 1, 1, 0)]
+        assert [(t.old_version, t.new_version, t.new, t.same) for t in found.tiles] == [(1, 2, 3, 1), (0, 1, 1, 0)]
         assert found.noun == "features"
 
 
@@ -284,7 +284,7 @@ def test_commands_with_a_layer(store: SqliteStore) -> None:
         "lane_boundary": 1,
         "traffic_sign": 1,
     }
-    assert "features: 1 added, 1 removed, 0 changed, 1 the same" in gnd_map(
+    assert "features: 1 new, 1 deleted, 0 modified, 1 the same" in gnd_map(
         "diff", path, "--tile", TILE.path, "--layer", "signs"
     )
     history = json.loads(gnd_map("history", path, TILE.path, "--layer", "signs", "--json"))

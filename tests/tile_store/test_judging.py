@@ -93,7 +93,7 @@ def test_accepting_changes_nothing_but_the_record_and_holds_for_these_voxels_alo
     assert (told.judgement, told.key) == ("accepted", change().key)
     grown = change(ChangedTile(TILE, 1, 2, (3, 7), ()))
     assert grown.key != told.key
-    assert replace(change(), what="changed").key != told.key
+    assert replace(change(), what="modified").key != told.key
 
 
 @pytest.mark.parametrize("decide", ["accept", "roll back", "doubt"])

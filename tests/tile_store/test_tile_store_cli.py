@@ -123,21 +123,21 @@ def test_diff_of_two_stores(path: Path, tmp_path: Path) -> None:
     with SqliteStore(other) as store:
         store.put_tiles([tile_of_voxels(TILE, 1, 2), tile_of_voxels(FAR, 1, 2, 3)])
     told = as_json("diff", other, path)
-    assert (told["added"], told["removed"], told["tiles_same"]) == (6, 1, 1)
-    assert "2 tiles differ, 1 are the same; voxels: 6 added, 1 removed, 0 changed" in gnd_map("diff", other, path)
+    assert (told["new"], told["deleted"], told["tiles_same"]) == (6, 1, 1)
+    assert "2 tiles differ, 1 are the same; voxels: 6 new, 1 deleted, 0 modified" in gnd_map("diff", other, path)
     assert "0 tiles differ, 3 are the same" in gnd_map("diff", path, path)
 
 
 def test_diff_of_two_versions_of_a_tile(path: Path) -> None:
     for arguments in (["--versions", "1..2"], []):
         told = as_json("diff", path, "--tile", TILE.morton, *arguments)
-        assert (told["added"], told["removed"], told["same"]) == (2, 1, 2)
-    assert as_json("diff", path, "--tile", TILE.path, "--versions", "2..1")["added"] == 1
+        assert (told["new"], told["deleted"], told["same"]) == (2, 1, 2)
+    assert as_json("diff", path, "--tile", TILE.path, "--versions", "2..1")["new"] == 1
 
 
 def test_diff_since_a_time(path: Path) -> None:
     told = as_json("diff", path, "--since", "2001-01-01")
-    assert (told["added"], len(told["tiles"])) == (10, 3)
+    assert (told["new"], len(told["tiles"])) == (10, 3)
     assert as_json("diff", path, "--since", "2199-01-01T00:00:00Z")["tiles"] == []
 
 

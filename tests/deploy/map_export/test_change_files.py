@@ -97,9 +97,9 @@ def test_objects_are_found_where_and_as_large_as_they_are(two_maps: tuple[Path, 
     with SqliteStore(two_maps[0]) as old, SqliteStore(two_maps[1]) as new:
         found = map_changes(old, new, layer="ndt")
     kinds = by_kind(found.changes)
-    assert set(kinds) == {("new", "object"), ("gone", "pole"), ("changed", "wall")}
+    assert set(kinds) == {("new", "object"), ("deleted", "pole"), ("modified", "wall")}
     assert found.alone == 1  # the speck
-    car, post, wall = kinds["new", "object"], kinds["gone", "pole"], kinds["changed", "wall"]
+    car, post, wall = kinds["new", "object"], kinds["deleted", "pole"], kinds["modified", "wall"]
     assert (car.voxels, post.voxels, wall.voxels) == (8, 3, 12)
     assert (car.points, post.tiles) == (400, (TILE.path,))
     # 4 x 2 voxels of 1 m: middles 3 and 1 m apart, and 0.2 * sqrt(3) m on both sides
@@ -122,7 +122,7 @@ def test_the_reports_say_when_and_how_many_vehicles(healed: Path) -> None:
     with SqliteStore(healed) as store:
         found = map_changes(store, store, layer="ndt", tile=TILE, versions=(1, 2))
     kinds = by_kind(found.changes)
-    car, post = kinds["new", "object"], kinds["gone", "pole"]
+    car, post = kinds["new", "object"], kinds["deleted", "pole"]
     assert (car.vehicles, car.reports, car.confidence) == (2, 2, 1.0)
     assert (post.vehicles, post.reports, post.confidence) == (1, 1, 0.0)
     for moment, after_s in ((car.first_seen, 0), (car.last_seen, 1), (post.first_seen, 1), (post.last_seen, 1)):
@@ -143,13 +143,13 @@ def test_equal_maps_have_no_changes_and_noise_is_none(two_maps: tuple[Path, Path
 def test_a_gis_opens_the_geopackage(two_maps: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "changes.gpkg"
     text = diff(*two_maps, "--to", out)
-    assert "3 changes: 1 changed wall, 1 gone pole, 1 new object; 1 voxels that lie alone are left out" in text
+    assert "3 changes: 1 deleted pole, 1 modified wall, 1 new object; 1 voxels that lie alone are left out" in text
     info = pyogrio.read_info(out, layer="changes")
     assert (info["crs"], info["geometry_type"], info["features"]) == ("EPSG:4326", "Polygon", 3)
     assert dict(zip(info["fields"], info["dtypes"], strict=True))["last_seen"].startswith("datetime64")
     _, table = pyogrio.read_arrow(out, layer="changes")
     rows = table.to_pylist()
-    assert {row["change"]: row["voxels"] for row in rows} == {"changed": 12, "new": 8, "gone": 3}
+    assert {row["change"]: row["voxels"] for row in rows} == {"modified": 12, "new": 8, "deleted": 3}
     _, near = pyogrio.read_arrow(out, layer="changes", bbox=(*([rows[1]["lon_deg"], rows[1]["lat_deg"]] * 2),))
     assert [row["change"] for row in near.to_pylist()] == [rows[1]["change"]]
     with sqlite3.connect(out) as base:
@@ -174,7 +174,7 @@ def test_geojson_holds_the_same(two_maps: tuple[Path, Path], tmp_path: Path) -> 
 
 def test_versions_and_bad_names(healed: Path, tmp_path: Path) -> None:
     text = diff(healed, "--tile", TILE.path, "--to", tmp_path / "c.gpkg")
-    assert "2 changes: 1 gone pole, 1 new object" in text
+    assert "2 changes: 1 deleted pole, 1 new object" in text
     ran = CliRunner().invoke(gnd, ["map", "diff", str(healed), "--tile", TILE.path, "--to", str(tmp_path / "c.shp")])
     assert isinstance(ran.exception, StoreError)
     assert "changes go to .gpkg or .geojson" in str(ran.exception)

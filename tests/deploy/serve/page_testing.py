@@ -43,11 +43,11 @@ EAGER = StoreConfig(merge_delay_s=0.0, merge_after_reports=1)
 
 
 def street_tile(tile: TileId, *, wall: bool = True, hump: float = 0.0) -> Tile:
-    """Ground 24 m wide, and a wall of 5 m along its middle; `hump` lifts the south-western ground, m."""
+    """Ground 24 m wide, and a wall of 12 m, 10 m high, along its middle; `hump` lifts the south-western ground, m."""
     grid = VoxelGrid.of(tile)
     x, y = (one.ravel() for one in np.meshgrid(np.arange(3, 27), np.arange(3, 27)))
     ground = grid.voxel_id(x, y, np.full(len(x), FLOOR))
-    upright = grid.voxel_id(np.tile(np.arange(3, 27), 5), np.full(120, 15), np.repeat(np.arange(5) + FLOOR + 1, 24))
+    upright = grid.voxel_id(np.tile(np.arange(9, 21), 10), np.full(120, 15), np.repeat(np.arange(10) + FLOOR + 1, 12))
     flat, tall = [0.083, 0, 0, 0.083, 0, 0.0004], [0.083, 0, 0, 0.0004, 0, 0.083]
     rows = [(int(one), flat, 0.0) for one in ground] + [(int(one), tall, 0.0) for one in (upright if wall else ())]
     lifted = set(grid.voxel_id(x[:40], y[:40], np.full(40, FLOOR)).tolist())

@@ -126,7 +126,7 @@ def test_a_voxel_tells_its_story(page: ServedPage, street: LiveStreet) -> None:
     wall = diff(street_tile(HERE, wall=False).gaussians, street_tile(HERE).gaussians).put.voxel_id
     told = page.value(f"/api/voxel/{HERE.morton}/{wall[0]}")
     assert told["gaussian"] is None
-    assert [(step["version"], step["what"]) for step in told["steps"]] == [(1, "surveyed"), (2, "removed")]
+    assert [(step["version"], step["what"]) for step in told["steps"]] == [(1, "surveyed"), (2, "deleted")]
     (report,) = told["steps"][1]["reports"]
     assert (report["vehicle"], report["says"]) == ("vehicle-07", "deleted")
     assert report["rays"] == {"blocked_inside": 7, "blocked_outside": 1, "in_empty": 0, "passed_inside": 3}
@@ -138,10 +138,10 @@ def test_a_voxel_tells_its_story(page: ServedPage, street: LiveStreet) -> None:
 
 def test_the_work_list_names_what_changed_and_who_said_so(page: ServedPage) -> None:
     found = page.value("/api/changes")["changes"]
-    assert {"gone", "changed"} <= {one["change"] for one in found}
-    gone = next(one for one in found if one["change"] == "gone")
-    assert (gone["shape"], gone["vehicles"], gone["voxels"]) == ("wall", 1, 120)
-    assert np.hypot(*gone["at_m"][:2]) < 20
+    assert {"deleted", "modified"} <= {one["change"] for one in found}
+    deleted = next(one for one in found if one["change"] == "deleted")
+    assert (deleted["shape"], deleted["vehicles"], deleted["voxels"]) == ("wall", 1, 120)
+    assert np.hypot(*deleted["at_m"][:2]) < 20
 
 
 def test_status_history_overview_and_traffic(page: ServedPage, street: LiveStreet) -> None:

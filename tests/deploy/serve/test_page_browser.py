@@ -269,7 +269,7 @@ def test_changes_are_decided_from_the_work_list_with_pictures(
         window.tab.click("#tab-changes")
         before, after = shots_of(window, "New wall")
         assert (near(before, VERMILION), near(after, VERMILION) > 500) == (0, True), "it is in the second picture alone"
-        before, after = shots_of(window, "Gone wall")
+        before, after = shots_of(window, "Deleted wall")
         assert np.abs(before - after).max() > 60
 
         window.tab.get_by_role("button", name="Roll back: New wall").click()
@@ -282,7 +282,7 @@ def test_changes_are_decided_from_the_work_list_with_pictures(
         window.until(lambda state: state["gaussians"] == with_wall - 120, "the map follows")
         assert street.store.history("ndt", EAST)[-1].kind == "rollback"
 
-        window.tab.get_by_role("button", name="Accept: Gone wall").focus()
+        window.tab.get_by_role("button", name="Accept: Deleted wall").focus()
         window.tab.keyboard.press("Enter")
         window.tab.keyboard.press("Tab")
         window.tab.keyboard.press("Tab")

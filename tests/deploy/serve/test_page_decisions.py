@@ -54,16 +54,16 @@ def surveyed(tile, *, wall: bool) -> bytes:
 def test_accepting_doubting_and_rolling_back_do_what_they_say(page: ServedPage, street: LiveStreet) -> None:
     about = page.value("/api/map")
     assert about["may_decide"] is True
-    new, gone = change_of(page, "new"), change_of(page, "gone")
+    new, deleted = change_of(page, "new"), change_of(page, "deleted")
     assert new["parts"] == [{"tile": EAST.morton, "before": 1, "version": 2}]
 
     assert page.decide(new["key"], "accept").status == 200
     assert change_of(page, "new")["accepted"]["who"] == about["viewer"]
     assert [version for version, _ in state_of(street)] == [2, 2]
 
-    assert page.decide(gone["key"], "roll_back", "  it  stood\nbehind a lorry ").status == 200
+    assert page.decide(deleted["key"], "roll_back", "  it  stood\nbehind a lorry ").status == 200
     assert state_of(street)[0] == (3, surveyed(HERE, wall=True))
-    assert page.decide(gone["key"], "roll_back", "twice").status == 409
+    assert page.decide(deleted["key"], "roll_back", "twice").status == 409
     told = page.value("/api/changes")
     assert [one["change"] for one in told["changes"]] == ["new"]
     assert [(one["judgement"], one["why"]) for one in told["decided"]] == [
@@ -149,7 +149,7 @@ def test_a_shard_that_merges_meanwhile_is_not_disturbed(page: ServedPage, street
         while len(merged) < 3:
             assert thread.is_alive()
         assert page.decide(new, "roll_back", "not there").status == 200
-        answers = [page.decide(change_of(page, "gone")["key"], "accept").status for _ in range(3)]
+        answers = [page.decide(change_of(page, "deleted")["key"], "accept").status for _ in range(3)]
         n = len(merged)
         while len(merged) < n + 3:
             assert thread.is_alive()
