@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 ARGS ?=
 PYTHONS ?= $(PYTHON)
 TOOLS := build/tools
+ENGINE ?= $(firstword $(shell command -v docker podman) docker)
+BASE ?= python:3.11-slim
 # Tests run in three processes, also on two cores: those of the bus and of attacks wait for much of their time.
 # Whole fleets run one after the other in one of them, hosts in another, shards that are killed too: they need the cores.
 TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 3 || echo 0)
@@ -73,8 +75,8 @@ installed:       ## install what lies in dist/ into fresh environments and run a
 wheels: $(TOOLS)/.ready  ## ask the index which libraries have wheels for which Python and machine (needs a network)
 	$(TOOLS)/bin/python -m tools.wheels $(ARGS)
 
-image: $(TOOLS)/.ready  ## build the container image, with the version of this checkout
-	docker build -f deploy/Dockerfile --build-arg VERSION=$$($(TOOLS)/bin/python -m tools.dist --version) -t gnd-fleet .
+image: $(TOOLS)/.ready  ## build the container image by docker or podman, with the version of this checkout: make image BASE=python:3.11-slim@sha256:...
+	$(ENGINE) build -f deploy/Dockerfile --build-arg BASE=$(BASE) --build-arg VERSION=$$($(TOOLS)/bin/python -m tools.dist --version) -t gnd-fleet $(ARGS) .
 
 bench: setup     ## measure speed beside others who do the same work, on this machine: docs/benchmarks.md
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[peers]'

@@ -89,6 +89,27 @@ def test_every_package_of_the_lock_has_hashes() -> None:
     assert [entry.splitlines()[0] for entry in entries if "==" in entry and "--hash=sha256:" not in entry] == []
 
 
+def test_what_the_image_copies_is_sent_to_the_builder_and_nothing_else() -> None:
+    """No environment, run, drive or identity, and no machine code that was compiled for the building machine."""
+    lines = (DEPLOY.parent / ".dockerignore").read_text().splitlines()
+    rules = [line for line in lines if line and not line.startswith("#")]
+    assert rules[0] == "*"
+    sent = {line.removeprefix("!") for line in rules if line.startswith("!")}
+    copies = re.findall(r"^COPY (?!--from)(.+) \S+$", (DEPLOY / "Dockerfile").read_text(), re.M)
+    assert {Path(name).parts[0] for words in copies for name in words.split()} == sent
+    assert {"**/__pycache__", "src/gnd/ahead/_kernels.*.so", "deploy/identities", "deploy/drives"} <= set(rules)
+
+
+def test_what_programs_keep_lies_where_every_manifest_lets_them_write() -> None:
+    text = (DEPLOY / "Dockerfile").read_text()
+    for variable in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR"):
+        assert f"{variable}=/tmp/" in text
+    services = [yaml.safe_load((DEPLOY / name).read_text())["x-gnd"] for name in ("compose.yaml", "compose.cloud.yaml")]
+    assert all(one["tmpfs"][0].startswith("/tmp:") for one in services)
+    for name in ("router", "tiles", "shard"):
+        assert "mountPath: /tmp}" in (DEPLOY / "kubernetes" / "base" / f"{name}.yaml").read_text()
+
+
 def test_the_image_holds_every_folder_and_no_root() -> None:
     text = (DEPLOY / "Dockerfile").read_text()
     for folder in (DEPLOY.parent / "src" / "gnd").iterdir():
