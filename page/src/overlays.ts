@@ -93,7 +93,7 @@ function putLabels(labels: Label[]): void {
   const put: { x: number; y: number; half: number }[] = [];
   for (const one of labels.sort((a, b) => a.far - b.far)) {
     const half = one.element.offsetWidth / 2 + 2;
-    const covered = () => put.find((other) => Math.abs(other.x - one.x) < half + other.half && Math.abs(other.y - one.y) < LABEL_PX);
+    const covered = () => put.find((other) => Math.abs(other.x - one.x) < half + other.half && Math.abs(other.y - one.y) < LABEL_PX - 0.5); // y - 24 is not quite 24 less where it is rounded
     for (let other = covered(); other; other = covered()) one.y = other.y - LABEL_PX;
     put.push({ x: one.x, y: one.y, half });
     one.element.style.transform = `translate(-50%, -100%) translate(${one.x.toFixed(1)}px, ${one.y.toFixed(1)}px)`;

@@ -360,6 +360,35 @@ def test_labels_of_vehicles_at_one_place_do_not_cover_each_other(
     assert max(box["y"] for box in boxes) - min(box["y"] for box in boxes) < 120, "they stand close together"
 
 
+RISING = """message => {
+  let seen = 0, lowest = Infinity;
+  for (let up = 0; up < 60; up += 0.0317) {
+    const lifted = message.map(one => ({...one, at: one.at.map((x, i) => i === 3 ? x + up : x)}));
+    gndPage.hear({type: 'vehicles', vehicles: lifted});
+    gndPage.vehicles.draw(Infinity, gndPage.view.camera, 1280, 800);
+    const labels = [...document.querySelectorAll('#labels .label:not([hidden])')];
+    seen += labels.length;
+    for (const label of labels) lowest = Math.min(lowest, Number(label.style.transform.match(/, ([-0-9.]+)px/)[1]));
+  }
+  return [seen, lowest];
+}"""
+"""Vehicles rise until their labels leave the window: rounded, one label less 24 pixels is not always 24 less."""
+
+
+def test_labels_that_leave_the_window_above_do_not_stop_the_page(
+    open_page: Callable[..., Window], page: ServedPage
+) -> None:
+    window = open_page(page.url)
+    window.drawn()
+    at = window.tab.evaluate("gndPage.view.controls.target.toArray()")
+    vehicles = [{"name": f"vehicle-{n:02d}", "at": [0, *at], "heading_rad": None, "odometer_m": 1, "ended": False,
+                 "health": "good", "tiles": 0, "reports": 0, "doubts": 0} for n in range(4)]  # fmt: skip
+    seen, lowest = window.tab.evaluate(RISING, vehicles)
+    assert seen > 400
+    assert lowest < -60, "some stood above the window"
+    assert window.complaints == []
+
+
 @pytest.mark.parametrize("scheme", ["dark", "light"])
 @pytest.mark.parametrize("width", [900, 390])
 def test_axe_finds_nothing(open_page: Callable[..., Window], street: LiveStreet, scheme: str, width: int) -> None:
