@@ -67,7 +67,8 @@ def publish(
         return PublishResult("stale", head.version)
     is_old = head.version != publication.base_version or trust.is_outdated(c, claim.layer, publication.basis)
     if is_old or trials.open_trial(c, claim.layer, claim.tile) is not None:
-        inbox.postpone(c, claim, timing["steady"])  # ready at once, against the head as it is now
+        # Ready at once, against what is so now. The merge came to its end: it is no attempt that the tile has spoilt.
+        inbox.postpone(c, claim, timing["steady"], blameless=True)
         return PublishResult("stale", head.version)
     _check_reports(c, publication)
     result = PublishResult("unchanged", head.version)

@@ -162,6 +162,18 @@ def test_a_merge_against_a_head_that_has_moved_is_refused_and_ready_again_at_onc
     assert store.publish([publication(work, 1, 2)]) == [PublishResult("published", 3)]
 
 
+def test_a_merge_that_others_have_overtaken_again_and_again_is_no_fault_of_its_tile(store: Store) -> None:
+    """Six such attempts once had the tile set aside, as if its merges killed shards."""
+    store.put_tiles([tile_of_voxels(TILE, 1)])
+    store.put_reports([report(1)])
+    for number in range(8):
+        work = store.load(only_claim(store))
+        assert work.claim.attempts == 1
+        assert store.begin([work.claim], 10.0) == [True]
+        store.put_tiles([tile_of_voxels(TILE, 5 + number)])
+        assert [result.status for result in store.publish([publication(work, 1, 2)])] == ["stale"]
+
+
 def test_a_publication_of_nothing_claimed_is_refused(store: Store) -> None:
     store.put_reports([report(1)])
     work = store.load(only_claim(store))
