@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,15 @@ def drives_along(fleet: DeployedFleet, place: Path, vehicle: str, ports: list[in
 def assert_acknowledged(result: Mapping[str, object]) -> None:
     assert result["reports_acknowledged"] == result["reports_sent"], result
     assert int(str(result["reports_acknowledged"])) > 0
+
+
+def wait_merged(url: str) -> None:
+    """Until no upload and no tile waits."""
+    end_s = time.monotonic() + 60.0
+    with open_store(url, read_only=True) as store:
+        while store.counts().waiting or store.dirty_count():
+            assert time.monotonic() < end_s, store.counts()
+            time.sleep(0.1)
 
 
 def test_one_host_with_compose(place: Path, fleet: DeployedFleet) -> None:
@@ -261,6 +271,7 @@ def test_the_two_lines_of_the_readme(place: Path, fleet: DeployedFleet, new_data
     after = drives_along(fleet, place, "car-1", [first, second])
     assert_acknowledged(after)
     fleet.wait_healthy()
+    wait_merged(url)  # an acknowledgement says that it is kept, not that it is merged
     fleet.end()
     with open_store(url, read_only=True) as store:
         vehicles = {one.vehicle for one in store.vehicle_accounts()}
