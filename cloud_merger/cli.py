@@ -13,6 +13,7 @@ from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.merger import run_shard
 from gnd.cloud_merger.statements import Mode
 from gnd.ending import orderly
+from gnd.extras import need_shard
 from gnd.fleet_bus.health_options import metrics_options
 from gnd.fleet_bus.identity.options import identity_option
 from gnd.fleet_bus.settings_file import load_settings
@@ -60,6 +61,7 @@ def merger(
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return
+    need_shard()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -18,6 +18,8 @@ OF_A_FLEET: Final = LEFT_OUT - _EXTRA_OF_MODULE.keys()
 """What a whole fleet cannot run without."""
 OF_A_VEHICLE: Final = frozenset(("gtsam", "scipy"))
 """What one cannot run without: much of it only where it finds poles, new roads or lanes, and then it is too late."""
+OF_A_SHARD: Final = frozenset(("scipy", "sklearn"))
+"""The same of a shard: where it merges features, or follows the paper's rules."""
 EXTRA_OF: Final = {
     "gnd.vehicle_agent": "vehicle",
     "gnd.cloud_merger": "cloud",
@@ -60,6 +62,16 @@ def need_vehicle() -> None:
     """
     if missing := _missing(OF_A_VEHICLE):
         raise MissingExtra(f"{missing[0]} is not installed; it comes with: pip install 'gnd-fleet[vehicle]'")
+
+
+def need_shard() -> None:
+    """For who merges: refuse to begin where something is missing that a report may need.
+
+    Raises:
+        MissingExtra: with the module that is missing.
+    """
+    if missing := _missing(OF_A_SHARD):
+        raise MissingExtra(f"{missing[0]} is not installed; it comes with: pip install 'gnd-fleet[cloud]'")
 
 
 def _missing(modules: frozenset[str]) -> list[str]:

@@ -111,7 +111,7 @@ def test_a_map_is_read(cloud: Cloud, bare: Callable[..., Program]) -> None:
 
 COMMANDS = {
     "sim world picture street.json street.png": ("sim", "scipy"),
-    "merger --help": ("cloud", "scipy"),
+    "merger --id m": ("cloud", "scipy"),
     "localise drive.mcap --map map.sqlite": ("vehicle", "gtsam"),
     "agent --drive drive.mcap": ("vehicle", "gtsam"),
 }
@@ -138,6 +138,7 @@ def test_a_command_without_its_extra_says_which_in_one_line(
         "router --help",
         "localise --help",
         "agent --help",
+        "merger --help",
         "traffic --help",
         "config show fleet",
         "config show store",
