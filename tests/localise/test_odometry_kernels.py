@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gnd.vehicle_agent.localise.odometry import ClockModel
 from gnd.vehicle_agent.localise.odometry_kernels import integrate, resampled
 
 
@@ -45,3 +46,10 @@ def test_motion_equals_its_plain_twin(n, span_ns):
         T, course = np.empty((len(found[0]), 4, 4)), np.array([0.02, -0.01])
         integrate(*found, course, T)
         np.testing.assert_allclose(T, plain_integral(*found, course), atol=1e-11)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e-4, -3.7e-5])
+def test_the_time_of_one_stamp_is_that_of_many(rate: float) -> None:
+    clock = ClockModel(1_700_000_000_123_456_789, 0.0421, rate)
+    stamps = clock.at_ns + np.random.default_rng(5).integers(-(10**12), 10**12, 500)
+    assert [clock.of_stamp(int(one)) for one in stamps] == clock.of_stamps(stamps).tolist()

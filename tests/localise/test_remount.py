@@ -94,6 +94,17 @@ def test_wheels_are_where_the_vehicle_is_and_not_where_the_header_has_them():
     assert not mounting.unsettled
 
 
+def test_what_is_held_of_the_mount_is_of_its_newest_look():
+    asked, never = Mounting(header(height_m=0.0)), Mounting(header(height_m=0.0))
+    for k in range(6):
+        for mounting in (asked, never):
+            mounting.see(k * S, road(header(), k) @ mounting.T_used[:3, :3].T + mounting.T_used[:3, 3])
+        assert len(asked.wheels_m) == len(asked.T_used_vehicle(0.1 * k))  # held from here on
+    assert asked.off.any()
+    assert np.array_equal(asked.wheels_m, never.wheels_m)
+    assert np.array_equal(asked.T_used_vehicle(0.1), never.T_used_vehicle(0.1))
+
+
 def test_a_first_pose_waits_for_the_ground_only_where_the_header_cannot_be_right():
     assert not seen(header(), header(), scans=1).waits
     assert seen(header(height_m=0.0), header(), scans=1).waits
